@@ -1,0 +1,1 @@
+"""Simulation, metrics, experiments and benchmarks. No ROS."""

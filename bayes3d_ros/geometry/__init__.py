@@ -1,0 +1,1 @@
+"""Cameras, meshes and voxel grids: arrays in, arrays out."""

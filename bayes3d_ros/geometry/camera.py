@@ -1,0 +1,63 @@
+"""Pinhole intrinsics and depth images, in the camera optical frame (REP-103: x right, y down, z forward)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion. Integer pixel coordinates are pixel centres.
+
+    Focal lengths and principal point are in pixels, width and height in whole pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"focal lengths must be positive and finite, got fx={self.fx} fy={self.fy}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
+
+    def resized(self, width: int, height: int) -> "Intrinsics":
+        """The same camera at another resolution; pixel areas scale, so cx' = (cx + 1/2) s - 1/2."""
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height
+        )
+
+    def rays(self) -> Float[np.ndarray, "height width 3"]:
+        """The ray through every pixel centre, scaled so that its z is 1."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)
+
+
+def unproject(depth: Float[np.ndarray, "height width"], intrinsics: Intrinsics) -> Float[np.ndarray, "height width 3"]:
+    """Points in metres in the camera frame; where there is no return (NaN) the point is NaN."""
+    return intrinsics.rays() * depth[..., None]
+
+
+def project(
+    points: Float[np.ndarray, "*batch 3"], intrinsics: Intrinsics
+) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
+    """Pixel coordinates (u, v) and depth z of points in the camera frame, in metres."""
+    z = points[..., 2]
+    uv = points[..., :2] / z[..., None] * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+    return uv, z
+
+
+def resize_depth(
+    depth: Float[np.ndarray, "height width"], width: int, height: int
+) -> Float[np.ndarray, "new_height new_width"]:
+    """Nearest-neighbour resize: a minimum or a mean would bias depth, and no value is invented at edges."""
+    v = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
+    u = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(int)
+    return depth[v[:, None], u]

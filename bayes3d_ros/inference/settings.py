@@ -1,0 +1,54 @@
+"""Settings of the algorithms: frozen dataclasses, from which ROS parameters and yaml files are derived."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+def setting(default: Any, description: str, *, unit: str = "", low: Any = None, high: Any = None, choices=()) -> Any:
+    """A dataclass field that knows its description, unit and range."""
+    return field(
+        default=default,
+        metadata={"description": description, "unit": unit, "low": low, "high": high, "choices": tuple(choices)},
+    )
+
+
+def validate(settings: Any) -> None:
+    """Raise ValueError, naming the field, where a setting lies outside its range."""
+    for f in fields(settings):
+        value, meta = getattr(settings, f.name), f.metadata
+        if meta.get("choices") and value not in meta["choices"]:
+            raise ValueError(f"{f.name} must be one of {', '.join(meta['choices'])}, got {value!r}")
+        low, high = meta.get("low"), meta.get("high")
+        if (low is not None and not value >= low) or (high is not None and not value <= high):
+            raise ValueError(f"{f.name} must lie in [{low}, {high}] {meta['unit']}, got {value}".replace(" ,", ","))
+
+
+@dataclass(frozen=True)
+class ParserSettings:
+    """Settings of the scene parser. The model's own come first, the sampler's after them."""
+
+    max_objects: int = setting(8, "most objects a scene may hold", low=0, high=32)
+    fixed_objects: int = setting(-1, "parse exactly this many objects; -1 infers the number", low=-1, high=32)
+    count_ratio: float = setting(0.5, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
+    table: str = setting("auto", "where the table's plane comes from", choices=("auto", "pose", "depth"))
+    table_width: float = setting(1.2, "width of the table's prior area, along x of the table frame", unit="m", low=0.1)
+    table_depth: float = setting(1.2, "depth of the table's prior area, along y of the table frame", unit="m", low=0.1)
+    workspace_height: float = setting(0.5, "returns higher above the table are not parsed", unit="m", low=0.02)
+    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01)
+    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1)
+    score_width: int = setting(160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280)
+    window: int = setting(5, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
+    sigma_max: float = setting(0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4)
+    min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
+    particles: int = setting(128, "scenes carried by the sampler", low=1, high=100000)
+    ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)
+    seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.window % 2 == 0:
+            raise ValueError(f"window must be odd, got {self.window}")
+        if self.fixed_objects > self.max_objects:
+            raise ValueError(f"fixed_objects ({self.fixed_objects}) exceeds max_objects ({self.max_objects})")
+        if self.near >= self.far:
+            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")

@@ -1,0 +1,1 @@
+"""What the world is: objects, scenes, how they render, how likely an image is."""

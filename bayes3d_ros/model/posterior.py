@@ -1,0 +1,58 @@
+"""The posterior over scenes: weighted samples, and the summaries that people and robots read."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class SceneSamples(NamedTuple):
+    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres)."""
+
+    log_weight: Float[np.ndarray, "S"]  # normalised: exp sums to one
+    num_objects: Int[np.ndarray, "S"]
+    type: Int[np.ndarray, "S M"]  # index into the library, -1 where there is no object
+    face: Int[np.ndarray, "S M"]  # contact face 0..5, -1 where there is no object
+    position: Float[np.ndarray, "S M 3"]
+    orientation: Float[np.ndarray, "S M 4"]  # quaternion x y z w
+    p_outlier: Float[np.ndarray, "S"]
+    sigma: Float[np.ndarray, "S"]  # metres, a standard deviation
+
+
+@dataclass(frozen=True)
+class ObjectEstimate:
+    """One object of the best scene, with what the other samples say of it."""
+
+    type: str
+    type_probabilities: dict[str, float]
+    probability: float  # that it exists
+    position: Float[np.ndarray, "3"]  # T_camera_object
+    orientation: Float[np.ndarray, "4"]  # quaternion x y z w
+    covariance: Float[np.ndarray, "6 6"]  # x y z, then delta in R = Exp(delta) R_mean, on the camera's axes
+    contact_face: int
+
+
+@dataclass(frozen=True)
+class ScenePosterior:
+    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`."""
+
+    stamp_ns: int
+    frame_id: str
+    types: tuple[str, ...]
+    objects: tuple[ObjectEstimate, ...]  # listed from probability >= min_probability
+    num_objects: dict[int, float]
+    p_outlier: float  # posterior means
+    sigma: float
+    log_evidence: float  # log Bayes factor against the empty table
+    samples: SceneSamples
+    reconstruction: Float[np.ndarray, "height width"]  # metres, NaN where no surface; the size of the input
+    segmentation: Int[np.ndarray, "height width"]  # uint16, 0 = no object
+    T_camera_table: Float[np.ndarray, "4 4"]
+    ess: tuple[float, ...]  # effective sample size before resampling, as a fraction, of every stage
+    seconds: float
+    notes: tuple[str, ...] = field(default=())  # what a user should know of this frame, one line each
+
+
+class ParseError(Exception):
+    """A frame that cannot be parsed; the message is one line that says why and what was expected."""

@@ -1,0 +1,1 @@
+"""The nodes, and the only imports of rclpy and message packages."""
