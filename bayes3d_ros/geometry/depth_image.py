@@ -1,0 +1,104 @@
+"""Depth images as cameras send them (raw bytes, two encodings) to and from metres; no ROS, fields come as arguments.
+
+16UC1 (also called mono16 by some drivers) holds millimetres, 0 where there is no return; 32FC1 holds metres, where NaN,
+infinity, zero and negative values are no return. In metres there is one mark for no return: NaN.
+"""
+
+import array
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.geometry.camera import Intrinsics
+
+BytesLike = bytes | bytearray | memoryview | array.array | np.ndarray
+_PIXEL = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
+DEPTH_ENCODINGS = tuple(_PIXEL)
+
+
+def _pixel_type(encoding: str, is_bigendian: bool) -> np.dtype:
+    if encoding not in _PIXEL:
+        raise ValueError(f"encoding: expected one of {', '.join(DEPTH_ENCODINGS)}, got {encoding!r}")
+    return _PIXEL[encoding].newbyteorder(">" if is_bigendian else "<")
+
+
+def decode_depth(
+    data: BytesLike, width: int, height: int, step: int, encoding: str, is_bigendian: bool
+) -> Float[np.ndarray, "height width"]:
+    """Depth in metres, float32, NaN where there is no return, from the fields of a sensor_msgs/Image.
+
+    `step` is the length of a row in bytes, padding included. Raises ValueError, one line that names the field and what
+    was expected of it, for fields that disagree or an encoding that is not a depth encoding.
+    """
+    pixel = _pixel_type(encoding, is_bigendian)
+    if width < 1 or height < 1:
+        raise ValueError(f"width, height: expected a positive image size, got {width}x{height}")
+    used = width * pixel.itemsize
+    if step < used:
+        raise ValueError(f"step: expected at least {used} bytes a row ({width} pixels of {encoding}), got {step}")
+    raw = np.frombuffer(data, np.uint8)
+    if len(raw) != step * height:
+        raise ValueError(f"data: expected {step * height} bytes (step {step} x height {height}), got {len(raw)}")
+    values = np.ascontiguousarray(raw.reshape(height, step)[:, :used]).view(pixel)
+    if pixel.kind == "u":
+        return np.where(values == 0, np.float32(np.nan), values.astype(np.float32) * np.float32(1e-3))
+    metres = values.astype(np.float32)
+    return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(np.nan))
+
+
+def encode_depth(
+    depth: Float[np.ndarray, "height width"],
+    encoding: str = "16UC1",
+    is_bigendian: bool = False,
+    step: int | None = None,
+) -> bytes:
+    """The `data` of a sensor_msgs/Image from depth in metres; rows are zero-padded to `step` bytes (default: none).
+
+    16UC1 rounds to whole millimetres; what does not fit in them (NaN, not positive, beyond 65.535 m) becomes 0. Raises
+    ValueError for an unknown encoding or a step that is too small.
+    """
+    pixel = _pixel_type(encoding, is_bigendian)
+    height, width = depth.shape
+    used = width * pixel.itemsize
+    step = used if step is None else step
+    if step < used:
+        raise ValueError(f"step: expected at least {used} bytes a row ({width} pixels of {encoding}), got {step}")
+    if pixel.kind == "u":
+        millimetres = np.round(np.nan_to_num(np.asarray(depth, np.float64) * 1e3, nan=0.0, posinf=0.0, neginf=0.0))
+        values = np.where((millimetres >= 1) & (millimetres <= 65535), millimetres, 0).astype(pixel)
+    else:
+        values = np.asarray(depth).astype(pixel)
+    rows = np.zeros((height, step), np.uint8)
+    rows[:, :used] = np.ascontiguousarray(values).view(np.uint8).reshape(height, used)
+    return rows.tobytes()
+
+
+def intrinsics_from_camera_info(
+    k: Sequence[float], p: Sequence[float], width: int, height: int, image_size: tuple[int, int] | None = None
+) -> Intrinsics:
+    """Intrinsics from the fields of a sensor_msgs/CameraInfo: from P where it is set (rectified images), else from K.
+
+    k has 9 entries and p 12, row by row; width and height are CameraInfo's, `image_size` is (width, height) of the
+    image it goes with. Raises ValueError, one line that names the field, where they cannot be used or sizes disagree.
+    """
+    if len(k) != 9:
+        raise ValueError(f"CameraInfo K: expected 9 values, got {len(k)}")
+    if len(p) not in (0, 12):
+        raise ValueError(f"CameraInfo P: expected 12 values, got {len(p)}")
+    if image_size is not None and (width, height) != tuple(image_size):
+        raise ValueError(
+            f"CameraInfo width, height: expected the image's {image_size[0]}x{image_size[1]}, got {width}x{height}"
+        )
+    if len(p) == 12 and p[0] != 0:
+        name, (fx, fy, cx, cy) = "P", (p[0], p[5], p[2], p[6])
+    else:
+        name, (fx, fy, cx, cy) = "K", (k[0], k[4], k[2], k[5])
+    if name == "K" and k[0] == 0:
+        raise ValueError("CameraInfo K[0]: expected a focal length > 0, got 0, and P[0] is 0 as well")
+    try:
+        if not np.isfinite([cx, cy]).all():
+            raise ValueError(f"the principal point must be finite, got cx={cx} cy={cy}")
+        return Intrinsics(float(fx), float(fy), float(cx), float(cy), int(width), int(height))
+    except ValueError as error:
+        raise ValueError(f"CameraInfo {name}: {error}") from None
