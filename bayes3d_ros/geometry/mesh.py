@@ -1,0 +1,186 @@
+"""Triangle meshes: loading, surface samples, the minimum-volume box, and the facets an object can rest on."""
+
+import itertools
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+MILLIMETRES_FROM = 3.0  # a tabletop object larger than this (m) was very likely stored in millimetres
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used; one line that says why."""
+
+
+class SurfaceSamples(NamedTuple):
+    """Points spread evenly over a surface; every point stands for the same area."""
+
+    points: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]  # of the triangle the point lies on
+    area: float  # square metres a point
+
+
+class RestingFacet(NamedTuple):
+    """A way to lie on a plane."""
+
+    normal: Float[np.ndarray, "3"]  # unit, out of the object: points straight down when it rests
+    area: float  # square metres, of the polygon it stands on
+    stable: bool  # the centre of mass stands above that polygon
+    solid_angle: float  # steradians the polygon fills as seen from the centre of mass: how likely it is to rest so
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """A mesh in metres, all parts of the file in one. Raises MeshError with one line where it cannot be used."""
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such mesh file")
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # trimesh's loaders raise many kinds of errors, for every format its own
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MeshError(f"{path}: cannot be read as a mesh ({reason[:200]})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise MeshError(f"{path}: holds no triangles")
+    try:
+        check_mesh(mesh)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    mesh.process()
+    return mesh
+
+
+def check_mesh(mesh: trimesh.Trimesh) -> None:
+    """Raise MeshError where there is no solid to make: no triangles, coordinates not finite, or no volume."""
+    if len(mesh.faces) == 0:
+        raise MeshError("the mesh holds no triangles")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError("the mesh has vertices that are NaN or infinite")
+    try:
+        volume = ConvexHull(mesh.vertices[np.unique(mesh.faces)]).volume
+    except (QhullError, ValueError):
+        volume = 0.0
+    if not volume > 0:
+        raise MeshError(f"the mesh is flat or of zero size (extents {_metres(mesh.extents)})")
+
+
+def scale_warning(mesh: trimesh.Trimesh) -> str | None:
+    """One line where the mesh is so large that it was probably stored in millimetres, else None."""
+    if mesh.extents.max() <= MILLIMETRES_FROM:
+        return None
+    return f"the mesh measures {_metres(mesh.extents)}; meshes are read in metres, is this one in millimetres?"
+
+
+def _metres(extents: Float[np.ndarray, "3"]) -> str:
+    return " x ".join(f"{e:.3g}" for e in extents) + " m"
+
+
+def sample_surface(mesh: trimesh.Trimesh, spacing: float, seed: int = 0) -> SurfaceSamples:
+    """Points about `spacing` metres apart, uniform by area; the same seed gives the same points.
+
+    Faces are visited by their share of the cumulated area (so that no face gets too many or too few) and points
+    inside faces follow a low-discrepancy sequence: fewer gaps and clumps than independent random points.
+    """
+    areas = mesh.area_faces
+    total = float(areas.sum())
+    count = max(int(np.ceil(total / spacing**2)), 1)
+    start = np.random.default_rng(seed).random(3)
+    cumulated = np.cumsum(areas)
+    at = (np.arange(count) + start[0]) * (cumulated[-1] / count)
+    face = np.minimum(np.searchsorted(cumulated, at, side="right"), len(areas) - 1)
+    n = np.arange(count)
+    a, b = (start[1] + n * 0.7548776662466927) % 1.0, (start[2] + n * 0.5698402909980532) % 1.0
+    beyond = a + b > 1
+    a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+    corner, edge_a, edge_b = (mesh.triangles[:, 0], *(mesh.triangles[:, i] - mesh.triangles[:, 0] for i in (1, 2)))
+    points = corner[face] + a[:, None] * edge_a[face] + b[:, None] * edge_b[face]
+    normals = np.cross(edge_a, edge_b)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return SurfaceSamples(points, normals[face], total / count)
+
+
+def minimum_box(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
+    """T_mesh_box and size of the box of least volume; its axes are named so that they lie closest to the mesh's."""
+    T_box_mesh, _ = trimesh.bounds.oriented_bounds(mesh.convex_hull.vertices)
+    axes = np.linalg.inv(T_box_mesh)[:3, :3]  # columns are the box's axes in the mesh frame
+    rotation = max((axes @ relabel for relabel in _axis_relabelings(np.linalg.det(axes) > 0)), key=np.trace)
+    along = mesh.convex_hull.vertices @ rotation
+    low, high = along.min(0), along.max(0)
+    T_mesh_box = np.eye(4)
+    T_mesh_box[:3, :3] = rotation
+    T_mesh_box[:3, 3] = rotation @ ((low + high) / 2)
+    return T_mesh_box, high - low
+
+
+def _axis_relabelings(proper: bool) -> list[Float[np.ndarray, "3 3"]]:
+    """The 24 signed permutations of determinant +1 (or, if not proper, -1)."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[list(order), range(3)] = signs
+            if (np.linalg.det(matrix) > 0) == proper:
+                found.append(matrix)
+    return found
+
+
+def resting_facets(
+    mesh: trimesh.Trimesh,
+    centre_of_mass: Float[np.ndarray, "3"],
+    merge_angle: float = np.deg2rad(3.0),
+    tolerance: float = 0.0015,
+) -> list[RestingFacet]:
+    """The facets of the convex hull, those within `merge_angle` taken as one; likeliest to rest on first.
+
+    The hull of a scanned base is many small facets, so a facet's direction is the area-weighted mean around a peak of
+    the hull's area over directions, and it stands on all hull vertices within `tolerance` metres of touching.
+    """
+    hull = mesh.convex_hull
+    normals, areas = hull.face_normals, hull.area_faces
+    left = areas > 0
+    facets = []
+    while left.any():
+        peak = normals[np.argmax(np.where(left, areas, 0))]
+        for _ in range(20):  # mean shift
+            near = (normals @ peak > np.cos(merge_angle)) & (areas > 0)
+            mean = areas[near] @ normals[near]
+            previous, peak = peak, mean / np.linalg.norm(mean)
+            if previous @ peak > 1 - 1e-12:
+                break
+        taken = left & (normals @ peak > np.cos(merge_angle))
+        if not taken.any():  # the peak walked off to one already taken
+            left[np.argmax(np.where(left, areas, 0))] = False
+            continue
+        left &= ~taken
+        facets.append(_facet(hull.vertices, peak, centre_of_mass, tolerance))
+    return sorted(facets, key=lambda f: (f.stable, f.solid_angle), reverse=True)
+
+
+def _facet(
+    vertices: Float[np.ndarray, "V 3"], normal: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"], tolerance: float
+) -> RestingFacet:
+    height = vertices @ normal
+    touching = vertices[height > height.max() - tolerance]
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    v = np.cross(normal, u)
+    flat = (touching - centre) @ np.stack([u, v], 1)
+    try:
+        polygon = ConvexHull(flat)
+    except (QhullError, ValueError):  # it touches in a point or along a line
+        return RestingFacet(normal, 0.0, False, 0.0)
+    stable = bool((polygon.equations[:, 2] <= 0).all())
+    corners = flat[polygon.vertices]
+    rim = np.column_stack([corners, np.full(len(corners), height.max() - centre @ normal)])
+    return RestingFacet(normal, float(polygon.volume), stable, _solid_angle(rim))
+
+
+def _solid_angle(polygon: Float[np.ndarray, "N 3"]) -> float:
+    """Of a convex planar polygon as seen from the origin (Van Oosterom and Strackee's formula on a fan)."""
+    unit = polygon / np.linalg.norm(polygon, axis=1, keepdims=True)
+    a, b, c = unit[:1], unit[1:-1], unit[2:]
+    triple = np.abs(np.einsum("ij,ij->i", np.cross(b, c), np.broadcast_to(a, b.shape)))
+    return float(2 * np.arctan2(triple, 1 + (a * b + b * c + c * a).sum(1)).sum())

@@ -1,0 +1,156 @@
+"""Solids on voxel grids, with a plane in every surface voxel; meshes need not be watertight."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface
+
+MAX_VOXELS = 2**25
+SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
+REACH = 0.15  # a voxel's plane serves its cube inflated by this fraction of a voxel on every side
+
+
+class VoxelSolid(NamedTuple):
+    """A solid and its surface; fields as in `model.objects.ObjectModel`."""
+
+    voxel_size: float
+    origin: Float[np.ndarray, "3"]
+    occupancy: Bool[np.ndarray, "X Y Z"]
+    surface_index: Int[np.ndarray, "S 3"]
+    surface_normal: Float[np.ndarray, "S 3"]
+    surface_offset: Float[np.ndarray, "S"]
+
+    @property
+    def centre_of_mass(self) -> Float[np.ndarray, "3"]:
+        return self.origin + (np.argwhere(self.occupancy).mean(0) + 0.5) * self.voxel_size
+
+
+def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
+    """The voxels that the surface passes through and those that it encloses.
+
+    What can be reached from outside through voxels without a surface is free: the inside of a mug stays open, and
+    gaps in the surface narrower than a voxel do not matter. Raises MeshError where the grid would be too large.
+    """
+    if not voxel_size > 0:
+        raise MeshError(f"the voxel size must be positive, got {voxel_size} m")
+    low, high = mesh.bounds
+    # The margin of 1/4 to 3/4 voxel keeps flat faces that lie along the grid away from the voxels' own faces.
+    shape = np.ceil((high - low) / voxel_size + 0.5)
+    if shape.prod() > MAX_VOXELS or mesh.area / voxel_size**2 > 1e6:
+        size = " x ".join(f"{n:.0f}" for n in shape)
+        raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; choose larger voxels")
+    shape = shape.astype(int)
+    origin = (low + high) / 2 - shape * voxel_size / 2
+    samples = sample_surface(mesh, voxel_size / SAMPLES_PER_EDGE)
+    patches = fit_planes(samples, origin, voxel_size, tuple(shape))
+    touched = np.zeros(shape, bool)
+    touched[tuple(patches.index.T)] = True
+    occupancy = fill_enclosed(touched)
+    keep = ~_redundant(patches, voxel_size, touched.shape)
+    dropped = ~keep & (patches.offset > 0)  # the centre lies behind the surface: solid, though not a surface voxel
+    occupancy[tuple(patches.index[~keep & ~dropped].T)] = False
+    return VoxelSolid(
+        float(voxel_size), origin, occupancy, patches.index[keep], patches.normal[keep], patches.offset[keep]
+    )
+
+
+def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+    """The surface voxels and all that no path of face neighbours from outside the grid can reach."""
+    labels, _ = ndimage.label(~np.pad(surface, 1))
+    return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
+
+
+class Patches(NamedTuple):
+    """The piece of surface in every voxel that has one, in C order of the voxels."""
+
+    index: Int[np.ndarray, "S 3"]
+    normal: Float[np.ndarray, "S 3"]
+    offset: Float[np.ndarray, "S"]  # metres from the voxel's centre, along the normal
+    centroid: Float[np.ndarray, "S 3"]  # metres from the voxel's centre
+    area: Float[np.ndarray, "S"]  # square metres
+
+
+def fit_planes(
+    samples: SurfaceSamples, origin: Float[np.ndarray, "3"], voxel_size: float, shape: tuple[int, int, int]
+) -> Patches:
+    """A plane in every voxel that holds a sample, fitted to the samples in and closely around the voxel.
+
+    Samples are weighted by a Gaussian around the centroid of those in the voxel, so that planes of neighbours agree.
+    Where two sheets of a thin wall share a voxel, the plane is that of the sheet with more area in it.
+    """
+    position = (samples.points - origin) / voxel_size
+    cell = np.clip(np.floor(position).astype(int), 0, np.array(shape) - 1)
+    keys, row = np.unique(np.ravel_multi_index(tuple(cell.T), shape), return_inverse=True)
+    index = np.stack(np.unravel_index(keys, shape), 1)
+    count = len(keys)
+    row_of = np.full(np.array(shape) + 2, -1)
+    row_of[tuple(index.T + 1)] = np.arange(count)
+
+    reference = _reference_normals(samples.normals, row, count)
+    same = np.einsum("ij,ij->i", samples.normals, reference[row]) > -0.3
+    ones = same.astype(float)
+    number = np.bincount(row, ones, count)
+    centroid = np.stack([np.bincount(row, ones * position[:, i], count) for i in range(3)], 1) / number[:, None]
+
+    width = 0.35
+    total, first, second = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    mean_normal = np.zeros((count, 3))
+    side = np.where(position - cell < 0.5, -1, 1)  # the 8 voxels whose half-voxel surroundings hold the sample
+    for step in itertools.product((0, 1), repeat=3):
+        target = row_of[tuple((cell + side * step + 1).T)]
+        sample = np.flatnonzero(target >= 0)
+        target = target[sample]
+        away = position[sample] - centroid[target]
+        agree = np.einsum("ij,ij->i", samples.normals[sample], reference[target])
+        weight = np.exp(-(away**2).sum(1) / (2 * width**2)) * (agree > -0.3)
+        total += np.bincount(target, weight, count)
+        for i in range(3):
+            first[:, i] += np.bincount(target, weight * away[:, i], count)
+            mean_normal[:, i] += np.bincount(target, weight * samples.normals[sample, i], count)
+            for j in range(i + 1):
+                second[:, i, j] += np.bincount(target, weight * away[:, i] * away[:, j], count)
+    mean = first / total[:, None]
+    covariance = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
+    normal = np.linalg.eigh(covariance)[1][:, :, 0]  # reads the lower triangle
+    normal *= np.where(np.einsum("ij,ij->i", normal, mean_normal) < 0, -1.0, 1.0)[:, None]
+    local = centroid + mean - index - 0.5
+    limit = np.sqrt(3) / 2
+    offset = np.clip(np.einsum("ij,ij->i", normal, local), -limit, limit)
+    area = np.bincount(row, minlength=count) * samples.area
+    return Patches(index, normal, offset * voxel_size, (centroid - index - 0.5) * voxel_size, area)
+
+
+def _reference_normals(
+    normals: Float[np.ndarray, "N 3"], row: Int[np.ndarray, "N"], count: int
+) -> Float[np.ndarray, "S 3"]:
+    """The side that a voxel's surface faces. Where two sheets face opposite sides, the larger one's."""
+    number = np.bincount(row, minlength=count)
+    mean = np.stack([np.bincount(row, normals[:, i], count) for i in range(3)], 1) / number[:, None]
+    outer = np.stack([np.bincount(row, normals[:, i] * normals[:, j], count) for i in range(3) for j in range(3)], 1)
+    axis = np.linalg.eigh(outer.reshape(-1, 3, 3))[1][:, :, 2]
+    axis *= np.where(np.einsum("ij,ij->i", axis, mean) < 0, -1.0, 1.0)[:, None]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    return np.where(length > 0.5, mean / np.maximum(length, 1e-12), axis)
+
+
+def _redundant(patches: Patches, voxel_size: float, shape: tuple[int, ...]) -> Bool[np.ndarray, "S"]:
+    """Voxels that the surface only clips, where a neighbour's plane, within its reach, covers the clip."""
+    row_of = np.full(np.array(shape) + 2, -1)
+    row_of[tuple(patches.index.T + 1)] = np.arange(len(patches.index))
+    small = np.flatnonzero(patches.area < 0.1 * voxel_size**2)
+    redundant = np.zeros(len(patches.index), bool)
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        if step == (0, 0, 0):
+            continue
+        neighbour = row_of[tuple((patches.index[small] + 1 + step).T)]
+        seen = patches.centroid[small] - np.array(step) * voxel_size  # from the neighbour's centre
+        within = (np.abs(seen) < (0.5 + REACH) * voxel_size).all(1)
+        miss = np.abs(np.einsum("ij,ij->i", patches.normal[neighbour], seen) - patches.offset[neighbour])
+        larger = patches.area[neighbour] > 2 * patches.area[small]
+        redundant[small] |= (neighbour >= 0) & within & larger & (miss < 0.05 * voxel_size)
+    return redundant

@@ -1,0 +1,92 @@
+"""Object models made from meshes."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from bayes3d_ros.geometry.mesh import MeshError, check_mesh, load_mesh, minimum_box, resting_facets, scale_warning
+from bayes3d_ros.geometry.voxels import voxelize
+from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel, save_model
+
+DEFAULT_VOXEL_SIZE = 0.003  # metres
+CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
+
+
+class ImportedMesh(NamedTuple):
+    """What became of one mesh file."""
+
+    mesh: Path
+    model: Path
+    warning: str | None  # one line, or None
+
+
+def import_meshes(
+    paths: Iterable[Path], folder: Path, voxel_size: float = DEFAULT_VOXEL_SIZE
+) -> Iterator[ImportedMesh]:
+    """Write a model for every mesh file into the library `folder`, yielding each as it is done.
+
+    Raises MeshError with one line naming the file: before anything is written for names that cannot be used, later
+    for a mesh that cannot be; models already yielded stay, and the failing one leaves the library as it was.
+    """
+    paths = [Path(path) for path in paths]
+    stems: dict[str, Path] = {}
+    for path in paths:
+        if not NAME_PATTERN.fullmatch(path.stem):
+            raise MeshError(f"{path}: the file's stem names the object, it may hold letters, digits, '_' and '-' only")
+        if path.stem in stems:
+            raise MeshError(f"{path}: names the same object as {stems[path.stem]}; rename one of them")
+        if not path.is_file():
+            raise MeshError(f"{path}: no such mesh file")
+        stems[path.stem] = path
+    for path in paths:
+        mesh = load_mesh(path)
+        try:
+            model = model_from_mesh(mesh, path.stem, voxel_size, source=path.name)
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from error
+        yield ImportedMesh(path, save_model(model, folder), scale_warning(mesh))
+
+
+def model_from_mesh(
+    mesh: trimesh.Trimesh | Path, name: str, voxel_size: float = DEFAULT_VOXEL_SIZE, source: str = ""
+) -> ObjectModel:
+    """The voxel model of a mesh, in the mesh's own frame. Raises MeshError with one line where none can be made."""
+    if isinstance(mesh, trimesh.Trimesh):
+        check_mesh(mesh)
+    else:
+        source = source or Path(mesh).name
+        mesh = load_mesh(Path(mesh))
+    solid = voxelize(mesh, voxel_size)
+    T_object_box, box_size = minimum_box(mesh)
+    contact_normal = contact_normals(mesh, T_object_box[:3, :3], solid.centre_of_mass)
+    return ObjectModel(
+        name=name,
+        **solid._asdict(),
+        T_object_box=T_object_box,
+        box_size=box_size,
+        contact_normal=contact_normal,
+        contact_height=(contact_normal @ mesh.convex_hull.vertices.T).max(1),
+        provenance={"kind": "mesh", "source": source, "watertight": bool(mesh.is_watertight)},
+    )
+
+
+def contact_normals(
+    mesh: trimesh.Trimesh, box_axes: Float[np.ndarray, "3 3"], centre_of_mass: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6 3"]:
+    """For each face of the box (+x -x +y -y +z -z) the direction that points down when the object rests on it.
+
+    It is the likeliest stable facet of the convex hull close to the face; where there is none the largest facet;
+    where the hull has none either, as on a sphere, the face's own normal.
+    """
+    facets = resting_facets(mesh, centre_of_mass)
+    faces = np.concatenate([box_axes.T, -box_axes.T]).reshape(2, 3, 3).swapaxes(0, 1).reshape(6, 3)
+    chosen = []
+    for face in faces:
+        near = [f for f in facets if f.normal @ face > np.cos(CONTACT_ANGLE) and f.area > 0]
+        best = max(near, key=lambda f: (f.stable, f.solid_angle if f.stable else f.area), default=None)
+        chosen.append(face if best is None else best.normal)
+    return np.array(chosen)
