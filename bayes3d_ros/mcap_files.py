@@ -1,0 +1,138 @@
+"""The recorded messages of a bag, undecoded: rosbag2 folders with MCAP storage, or bare .mcap files.
+
+Files are read from the front, without their index, so that a bag whose recorder was killed still gives every message
+before the damage. Errors are one line that names the file and what was expected.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+from mcap.exceptions import InvalidMagic
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+
+class BagError(Exception):
+    """A bag that cannot be used; one line naming the file or topic and what was expected."""
+
+
+class BagDamage(BagError):
+    """Part of a bag could not be read; raised after everything else in it has been delivered."""
+
+
+class RawMessage(NamedTuple):
+    """A recorded message: `t_ns` is when it was recorded, `data` its CDR bytes."""
+
+    topic: str
+    msgtype: str
+    t_ns: int
+    data: bytes
+
+
+class Topic(NamedTuple):
+    """A recorded topic with `count` messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+def raw_messages(bag: Path) -> Iterator[RawMessage]:
+    """Every message of a bag in the order of recording. Raises BagError; BagDamage after the last readable message."""
+    damage: BagDamage | None = None
+    for file in _files(bag):
+        try:
+            yield from _messages(file)
+        except BagDamage as error:  # the other files of a split bag may well be whole
+            damage = damage or error
+    if damage is not None:
+        raise damage
+
+
+def topics(bag: Path) -> dict[str, Topic]:
+    """The topics of a bag that hold messages, by name; of a damaged bag, those that can be read."""
+    found: dict[str, Topic] = {}
+    try:
+        for message in raw_messages(bag):
+            count = found[message.topic].count if message.topic in found else 0
+            found[message.topic] = Topic(message.topic, message.msgtype, count + 1)
+    except BagDamage:
+        pass
+    return dict(sorted(found.items()))
+
+
+def _files(bag: Path) -> list[Path]:
+    """The .mcap files of a bag in order: those its metadata.yaml lists, else (recorder killed) all of the folder."""
+    if not bag.exists():
+        raise BagError(f"{bag}: no such file or folder, expected a rosbag2 folder or an .mcap file")
+    if not bag.is_dir():
+        return [bag]
+    files = sorted(bag.glob("*.mcap"))
+    metadata = bag / "metadata.yaml"
+    if metadata.exists():
+        try:
+            information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+            storage, mode = information["storage_identifier"], information.get("compression_mode", "")
+            files = [bag / name for name in information["relative_file_paths"]]
+        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
+            raise BagError(f"{metadata}: expected the metadata of a rosbag2 recording") from None
+        if storage != "mcap":
+            raise BagError(f"{metadata}: expected storage_identifier mcap, got {storage} (ros2 bag convert makes one)")
+        if mode.lower() not in ("", "none"):
+            raise BagError(
+                f"{metadata}: expected no rosbag2 compression (MCAP's own is read), got compression_mode {mode}"
+            )
+    if not files:
+        raise BagError(f"{bag}: expected an .mcap file in this folder, found none")
+    for file in files:
+        if not file.exists():
+            raise BagError(f"{file}: expected this file, which {metadata.name} lists")
+    return files
+
+
+def _messages(file: Path) -> Iterator[RawMessage]:
+    try:
+        stream = file.open("rb")
+    except OSError as error:
+        raise BagError(f"{file}: expected a readable file: {error.strerror}") from None
+    with stream:
+        if file.stat().st_size == 0:
+            raise BagError(f"{file}: expected an MCAP file, it is empty (0 bytes)")
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        count = 0
+        records = StreamReader(stream, emit_chunks=True).records
+        while True:
+            try:
+                record = next(records)
+                inside = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+            except StopIteration:
+                return
+            except InvalidMagic:
+                if count or channels:  # the magic at the end
+                    raise _damage(file, count) from None
+                raise BagError(f"{file}: expected an MCAP file, it does not begin like one") from None
+            except Exception:  # whatever a decoder raises on damaged bytes: short reads, checksums, decompression
+                raise _damage(file, count) from None
+            inside = [r for r in inside if isinstance(r, Schema | Channel | Message)]
+            for definition in inside:
+                if isinstance(definition, Schema):
+                    schemas[definition.id] = definition
+                elif isinstance(definition, Channel):
+                    channels[definition.id] = definition
+            for message in sorted((r for r in inside if isinstance(r, Message)), key=lambda m: m.log_time):
+                channel = channels.get(message.channel_id)
+                if channel is None or channel.schema_id not in schemas:
+                    raise BagError(f"{file}: channel {message.channel_id}: expected its topic and message definition")
+                if channel.message_encoding != "cdr":
+                    raise BagError(
+                        f"{file}: {channel.topic}: expected messages in cdr, got {channel.message_encoding!r}"
+                    )
+                count += 1
+                yield RawMessage(channel.topic, schemas[channel.schema_id].name, message.log_time, message.data)
+
+
+def _damage(file: Path, count: int) -> BagDamage:
+    return BagDamage(f"{file}: expected a whole MCAP file, it is truncated or damaged after {count} readable messages")
