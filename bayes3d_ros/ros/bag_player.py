@@ -1,0 +1,154 @@
+"""bag_player BAG: publish a recorded bag's messages as they were recorded, for machines without rosbag2."""
+
+import argparse
+import importlib
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+
+from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
+
+CLOCK_PERIOD = 0.01  # seconds of real time
+
+
+class BagPlayer(Node):
+    """Publishes the recorded CDR bytes, reliable, at the times they were recorded."""
+
+    def __init__(self, bag: Path, only: list[str], clock: bool) -> None:
+        super().__init__("bag_player")
+        self._bag = bag
+        self.publishers_of: dict[str, Publisher] = {}
+        for name, topic in topics(bag).items():
+            if only and name not in only:
+                continue
+            try:
+                kind = message_class(topic.msgtype)
+            except ImportError:
+                self.get_logger().warning(f"{name} is left out: {topic.msgtype} is not installed")
+                continue
+            latched = name.split("/")[-1] == "tf_static"
+            qos = QoSProfile(
+                depth=100,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            )
+            self.publishers_of[name] = self.create_publisher(kind, name, qos)
+        if not self.publishers_of:
+            has = ", ".join(topics(bag)) or "none"
+            raise BagError(f"{bag}: expected topics to play{': ' + ', '.join(only) if only else ''}; the bag has {has}")
+        self._clock_publisher = self.create_publisher(Clock, "/clock", 10) if clock else None
+
+    def unheard(self) -> list[str]:
+        """The topics that nobody subscribes to."""
+        return [name for name, publisher in self.publishers_of.items() if publisher.get_subscription_count() == 0]
+
+    def wait_for_subscribers(self, seconds: float) -> None:
+        """Wait until every topic has a subscriber, but not longer than this."""
+        deadline = time.monotonic() + seconds
+        while self.unheard() and time.monotonic() < deadline:
+            rclpy.spin_once(self, timeout_sec=0.05)
+        if self.unheard():
+            self.get_logger().warning(f"nobody subscribes to {', '.join(self.unheard())}; playing all the same")
+
+    def play(self, rate: float) -> int:
+        """Publish every message once; the number published. Raises BagDamage at the damaged end of a bag."""
+        published = 0
+        first: int | None = None
+        start = time.monotonic()
+        for message in self._chosen():
+            first = message.t_ns if first is None else first
+            self._wait_until(start, first, message.t_ns, rate)
+            self.publishers_of[message.topic].publish(message.data)
+            published += 1
+        return published
+
+    def finish(self, seconds: float) -> None:
+        """Let subscribers acknowledge what was sent, but wait no longer than this."""
+        deadline = time.monotonic() + seconds
+        for publisher in self.publishers_of.values():
+            left = max(deadline - time.monotonic(), 0.0)
+            publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=left))
+
+    def _chosen(self) -> Iterator[RawMessage]:
+        return (message for message in raw_messages(self._bag) if message.topic in self.publishers_of)
+
+    def _wait_until(self, start: float, first_ns: int, t_ns: int, rate: float) -> None:
+        """Sleep until a recorded time is due, keeping the clock going."""
+        due = start + (t_ns - first_ns) * 1e-9 / rate
+        while (left := due - time.monotonic()) > 0:
+            if not rclpy.ok():
+                raise ExternalShutdownException
+            self._publish_clock(t_ns - int(left * rate * 1e9))
+            time.sleep(min(left, CLOCK_PERIOD if self._clock_publisher else 0.1))
+        self._publish_clock(t_ns)
+
+    def _publish_clock(self, t_ns: int) -> None:
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(Clock(clock=Time(nanoseconds=max(t_ns, 0)).to_msg()))
+
+
+def message_class(msgtype: str) -> Any:
+    """The class of a message type such as sensor_msgs/msg/Image. Raises ImportError where it is not installed."""
+    package, _, name = msgtype.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except AttributeError:
+        raise ImportError(f"{package}.msg has no {name}") from None
+
+
+def _arguments(argv: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="bag_player", description=__doc__)
+    parser.add_argument("bag", type=Path, help="rosbag2 folder with MCAP storage, or an .mcap file")
+    parser.add_argument("--rate", type=_positive, default=1.0, help="times the recorded speed")
+    parser.add_argument("--loop", action="store_true", help="start again at the end; stamps go backwards then")
+    parser.add_argument("--clock", action="store_true", help="publish /clock, for nodes with use_sim_time")
+    parser.add_argument("--wait", type=float, default=1.0, help="seconds to wait for a subscriber on every topic")
+    parser.add_argument("--topics", nargs="+", default=[], help="play only these")
+    return parser.parse_args(argv)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
+    return value
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a bag; 0 at its end or when told to stop, 1 if its end is damaged, 2 for bad usage or a bad bag."""
+    argv = sys.argv if args is None else ["bag_player", *args]
+    arguments = _arguments(remove_ros_args(argv)[1:])
+    status = 0
+    try:
+        rclpy.init(args=argv)
+        player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
+        player.wait_for_subscribers(arguments.wait)
+        while True:
+            played = player.play(arguments.rate)
+            player.get_logger().info(f"played {played} messages of {arguments.bag}")
+            if not arguments.loop:
+                break
+        player.finish(2.0)
+    except BagError as error:
+        sys.stderr.write(f"bag_player: {error}\n")
+        status = 1 if isinstance(error, BagDamage) else 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""ROS messages to arrays and back. Nothing else in the package knows a message's fields."""
+
+import array
+from collections.abc import Mapping
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import Header, String
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.summaries import posterior_rows
+
+_POINT_TYPE = {np.dtype(np.float32): PointField.FLOAT32, np.dtype(np.int32): PointField.INT32}
+
+
+def stamp_to_ns(stamp: Time) -> int:
+    """A stamp in nanoseconds."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def ns_to_stamp(ns: int) -> Time:
+    """Nanoseconds as a stamp."""
+    sec, nanosec = divmod(ns, 10**9)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def depth_from_image(image: Image) -> Float[np.ndarray, "height width"]:
+    """Metres, NaN where there is no return. ValueError with one line naming the field that is wrong."""
+    return decode_depth(
+        image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian)
+    )
+
+
+def intrinsics_from_message(info: CameraInfo, image: Image) -> Intrinsics:
+    """The intrinsics of an image. ValueError with one line naming the field that is wrong."""
+    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (image.width, image.height))
+
+
+def frame_from_messages(
+    image: Image, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
+) -> DepthFrame:
+    """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
+    intrinsics = intrinsics_from_message(info, image)
+    try:
+        depth = depth_from_image(image)
+    except ValueError as error:
+        raise ValueError(f"Image {error}") from None
+    return DepthFrame(depth, intrinsics, stamp_to_ns(image.header.stamp), image.header.frame_id, T_table_camera)
+
+
+def pose_to_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
+    """The transform of a pose. ValueError where it is not finite or its quaternion not of length one (within 1 %)."""
+    p, q = pose.position, pose.orientation
+    return matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+
+
+def matrix_from_values(values: list[float]) -> Float[np.ndarray, "4 4"]:
+    """The transform of x y z qx qy qz qw, in metres. ValueError as pose_to_matrix."""
+    numbers = np.asarray(values, float)
+    if numbers.shape != (7,):
+        raise ValueError(f"pose: expected 7 numbers x y z qx qy qz qw, got {numbers.size}")
+    if not np.isfinite(numbers).all():
+        raise ValueError("pose: expected finite numbers, got NaN or infinity")
+    length = float(np.linalg.norm(numbers[3:]))
+    if abs(length - 1) > 0.01:
+        raise ValueError(f"pose orientation: expected a quaternion of length 1, got length {length:.3g}")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
+    return T
+
+
+def pose_message(position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Pose:
+    """A pose from a position in metres and a quaternion x y z w."""
+    x, y, z = (float(v) for v in position)
+    qx, qy, qz, qw = (float(v) for v in orientation)
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def matrix_to_pose(T: Float[np.ndarray, "4 4"]) -> Pose:
+    """The pose of a transform."""
+    return pose_message(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat())
+
+
+def header(posterior: ScenePosterior) -> Header:
+    """The header of every output: the image's stamp and frame."""
+    return Header(stamp=ns_to_stamp(posterior.stamp_ns), frame_id=posterior.frame_id)
+
+
+def pose_array(posterior: ScenePosterior) -> PoseArray:
+    """The poses of the best scene; pose k is of the object labelled k + 1."""
+    poses = [pose_message(o.position, o.orientation) for o in posterior.objects]
+    return PoseArray(header=header(posterior), poses=poses)
+
+
+def image_message(pixels: np.ndarray, encoding: str, image_header: Header) -> Image:
+    """A one-channel image; pixels already have the encoding's type."""
+    height, width = pixels.shape
+    little = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False))
+    message = Image(header=image_header, height=height, width=width, encoding=encoding, is_bigendian=0)
+    message.step = width * pixels.itemsize
+    message.data = array.array("B", little.tobytes())  # a numpy array or a list takes a thousand times as long
+    return message
+
+
+def segmentation_image(posterior: ScenePosterior) -> Image:
+    """16UC1: 0 none, k + 1 where object k is seen."""
+    return image_message(posterior.segmentation.astype(np.uint16), "16UC1", header(posterior))
+
+
+def reconstruction_image(posterior: ScenePosterior) -> Image:
+    """32FC1: depth of the best scene in metres, NaN where there is no surface."""
+    return image_message(posterior.reconstruction.astype(np.float32), "32FC1", header(posterior))
+
+
+def posterior_cloud(posterior: ScenePosterior, object_index: Int[np.ndarray, "S M"]) -> PointCloud2:
+    """A point per object per sample; a sample without objects is one point with object = -1 (model/summaries.py)."""
+    return cloud_message(posterior_rows(posterior.samples, object_index), header(posterior))
+
+
+def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:
+    """An unordered cloud with a point per row of a structured array of float32 and int32 fields."""
+    cloud = PointCloud2(header=cloud_header, height=1, width=len(rows), is_bigendian=False, is_dense=False)
+    types: Mapping = rows.dtype.fields or {}
+    cloud.fields = [
+        PointField(name=name, offset=offset, datatype=_POINT_TYPE[kind], count=1)
+        for name, (kind, offset, *_) in types.items()
+    ]
+    cloud.point_step = rows.dtype.itemsize
+    cloud.row_step = cloud.point_step * len(rows)
+    cloud.data = array.array("B", rows.tobytes())
+    return cloud
+
+
+def rows_from_cloud(cloud: PointCloud2) -> np.ndarray:
+    """The structured array of a cloud of FLOAT32 and INT32 fields: the inverse of cloud_message."""
+    kinds = {value: key for key, value in _POINT_TYPE.items()}
+    row = np.dtype(
+        {
+            "names": [f.name for f in cloud.fields],
+            "formats": [kinds[f.datatype] for f in cloud.fields],
+            "offsets": [f.offset for f in cloud.fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+    return np.frombuffer(cloud.data, row.newbyteorder(">" if cloud.is_bigendian else "<"))
+
+
+def library_message(names: tuple[str, ...]) -> String:
+    """Type names, one a line, in the order of `type`."""
+    return String(data="\n".join(names))

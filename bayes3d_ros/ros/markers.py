@@ -1,0 +1,71 @@
+"""A scene as RViz shows it: voxels, names and uncertainties of its objects."""
+
+import colorsys
+
+import numpy as np
+from geometry_msgs.msg import Point, Vector3
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from bayes3d_ros.model.objects import Library, ObjectModel
+from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.ros.conversions import header, pose_message
+
+_TEXT_HEIGHT = 0.02  # metres
+
+
+class SceneMarkers:
+    """Makes marker arrays for the objects of one library."""
+
+    def __init__(self, library: Library) -> None:
+        self._models = {model.name: model for model in library.models}
+        self._voxels = {model.name: _voxel_points(model) for model in library.models}
+
+    def __call__(self, posterior: ScenePosterior) -> MarkerArray:
+        """Markers of one scene; the first one deletes all that were shown before. Ids are labels.
+
+        Namespaces: `voxels` (surface voxels), `names` (type and p(exists)), `uncertainty` (ellipsoid of two standard
+        deviations of the position).
+        """
+        markers = [Marker(header=header(posterior), action=Marker.DELETEALL)]
+        for label, estimate in enumerate(posterior.objects, start=1):
+            pose = pose_message(estimate.position, estimate.orientation)
+            voxels = Marker(type=Marker.CUBE_LIST, pose=pose, color=label_colour(label, 0.8))
+            model = self._models[estimate.type]
+            voxels.scale = Vector3(x=model.voxel_size, y=model.voxel_size, z=model.voxel_size)
+            voxels.points = self._voxels[estimate.type]
+
+            name = Marker(type=Marker.TEXT_VIEW_FACING, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
+            above = estimate.position - [0.0, 0.5 * float(np.max(model.box_size)) + _TEXT_HEIGHT, 0.0]  # y points down
+            name.pose = pose_message(above, np.array([0.0, 0.0, 0.0, 1.0]))
+            name.scale.z = _TEXT_HEIGHT
+            name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
+
+            orientation, axes = ellipsoid(estimate.covariance[:3, :3])
+            spread = Marker(type=Marker.SPHERE, color=label_colour(label, 0.4))
+            spread.pose = pose_message(estimate.position, orientation)
+            spread.scale = Vector3(**dict(zip("xyz", (2 * 2 * axes).tolist(), strict=True)))
+            for namespace, marker in (("voxels", voxels), ("names", name), ("uncertainty", spread)):
+                marker.header, marker.ns, marker.id, marker.action = header(posterior), namespace, label, Marker.ADD
+                markers.append(marker)
+        return MarkerArray(markers=markers)
+
+
+def ellipsoid(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
+    """Quaternion x y z w and standard deviations (at least 0.1 mm, to be seen) along the principal axes."""
+    variance, axes = np.linalg.eigh(covariance)
+    axes = axes * np.sign(np.linalg.det(axes))
+    return Rotation.from_matrix(axes).as_quat(), np.sqrt(np.maximum(variance, 1e-8))
+
+
+def label_colour(label: int, alpha: float) -> ColorRGBA:
+    """A colour per label; neighbours differ most (golden-angle hues)."""
+    r, g, b = colorsys.hsv_to_rgb(label * 0.61803398875 % 1.0, 0.75, 0.95)
+    return ColorRGBA(r=r, g=g, b=b, a=alpha)
+
+
+def _voxel_points(model: ObjectModel) -> list[Point]:
+    centres = model.origin + (model.surface_index + 0.5) * model.voxel_size
+    return [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in centres]

@@ -1,0 +1,195 @@
+"""ROS parameters, their descriptors and the yaml files, all derived from the dataclasses of settings."""
+
+import math
+import sys
+import textwrap
+from dataclasses import MISSING, Field, dataclass, fields
+from typing import Any, TypeVar
+
+import yaml
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from bayes3d_ros.inference.settings import ParserSettings, setting, validate
+from bayes3d_ros.ros.conversions import matrix_from_values
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True)
+class SceneParserNodeSettings:
+    """What the scene_parser node needs beside the parser's own settings."""
+
+    library: str = setting("", "folder of object models (bayes3d import); read on configure and on reload")
+    autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
+    qos_reliability: str = setting(
+        "auto",
+        "reliability of the input subscriptions; auto is reliable until a best-effort publisher is met",
+        choices=("auto", "reliable", "best_effort"),
+    )
+    table_frame: str = setting("table", "frame of the table: z up, origin on the table")
+    camera_pose: tuple[float, ...] = setting(
+        (), "camera pose in table_frame where no topic or tf gives one: x y z qx qy qz qw; empty for none"
+    )
+    warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
+    warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
+    patience: float = setting(
+        0.5, "how long an image waits for its CameraInfo and camera pose", unit="s", low=0.0, high=10.0
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.camera_pose:
+            try:
+                matrix_from_values(list(self.camera_pose))
+            except ValueError as error:
+                raise ValueError(f"camera_pose: {error}") from None
+
+
+SCENE_PARSER_SETTINGS: tuple[type, ...] = (SceneParserNodeSettings, ParserSettings)
+FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
+
+
+class SettingsParameters:
+    """Declares the fields of settings dataclasses as a node's parameters, keeps them valid and reads them back.
+
+    A value from a file or the command line that is wrong does not stop the node: the default stands in for it and
+    `problems` says what is wrong, until the parameter is set again.
+    """
+
+    def __init__(self, node: Node, kinds: tuple[type, ...]) -> None:
+        self._node, self._kinds = node, kinds
+        self.problems: dict[str, str] = {}
+        for kind in kinds:
+            for field in fields(kind):
+                self._declare(field)
+
+    def read(self, kind: type[Settings]) -> Settings:
+        """The settings as they are now. ValueError with one line naming the parameter."""
+        if self.problems:
+            raise ValueError("; ".join(self.problems.values()))
+        try:
+            return self._build(kind, {})
+        except ValueError as error:
+            raise ValueError(f"parameter {error}") from None
+
+    def check(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Whether these values may be set: for add_on_set_parameters_callback."""
+        changed = {p.name: p.value for p in parameters}
+        try:
+            for kind in self._kinds:
+                self._build(kind, changed)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        for name in changed:
+            self.problems.pop(name, None)
+        return SetParametersResult(successful=True)
+
+    def _declare(self, field: Field) -> None:
+        descriptor, default = describe(field), parameter_value(field)
+        try:
+            self._node.declare_parameter(field.name, default, descriptor)
+            _typed(field, self._node.get_parameter(field.name).value)
+        except (InvalidParameterTypeException, InvalidParameterValueException, InvalidParameterException) as error:
+            reason = str(error).splitlines()[0].removesuffix(f": {field.name}")
+            self.problems[field.name] = f"parameter {field.name}: {reason}"
+        except ValueError as error:
+            self.problems[field.name] = f"parameter {error}"
+        if field.name in self.problems:
+            if self._node.has_parameter(field.name):
+                self._node.undeclare_parameter(field.name)
+            self._node.declare_parameter(field.name, default, descriptor, ignore_override=True)
+
+    def _build(self, kind: type[Settings], changed: dict[str, Any]) -> Settings:
+        values = {}
+        for field in fields(kind):  # type: ignore[arg-type]
+            value = changed[field.name] if field.name in changed else self._node.get_parameter(field.name).value
+            values[field.name] = _typed(field, value)
+        return kind(**values)
+
+
+def parameter_value(field: Field) -> Any:
+    """A field's default as a parameter's value. An empty pose is an empty list of doubles."""
+    if field.default is MISSING:
+        raise TypeError(f"setting {field.name} has no default")
+    return list(field.default) if isinstance(field.default, tuple) else field.default
+
+
+def describe(field: Field) -> ParameterDescriptor:
+    """The descriptor of a setting: description with its unit, range, and the type where it is not a number."""
+    meta = field.metadata
+    unit = f" [{meta['unit']}]" if meta["unit"] else ""
+    descriptor = ParameterDescriptor(name=field.name, description=meta["description"] + unit)
+    # Numbers and lists are typed here and not by rclpy, so that `far: 3` does for 3.0 and `[]` for no pose.
+    descriptor.dynamic_typing = isinstance(field.default, (float, tuple))
+    descriptor.read_only = field.name == "autostart"
+    if meta["choices"]:
+        descriptor.additional_constraints = "one of: " + ", ".join(meta["choices"])
+    low, high = meta["low"], meta["high"]
+    if low is None and high is None:
+        return descriptor
+    if isinstance(field.default, int):
+        bounds = (-(2**63) if low is None else low, 2**63 - 1 if high is None else high)
+        descriptor.integer_range = [IntegerRange(from_value=int(bounds[0]), to_value=int(bounds[1]))]
+    else:
+        limit = sys.float_info.max
+        bounds = (-limit if low is None else low, limit if high is None else high)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(bounds[0]), to_value=float(bounds[1]))]
+    return descriptor
+
+
+def _typed(field: Field, value: Any) -> Any:
+    """A parameter's value as the setting's type. ValueError naming the setting."""
+    expected = type(field.default)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if expected is float and number:
+        if not math.isfinite(value):
+            raise ValueError(f"{field.name} must be finite, got {value}")
+        return float(value)
+    if expected is tuple:
+        values = [] if value is None else value
+        if isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
+            raise ValueError(f"{field.name} must be a list of numbers, got {value!r}")
+        try:
+            return tuple(float(v) for v in values)
+        except (TypeError, ValueError):
+            raise ValueError(f"{field.name} must be a list of numbers, got {value!r}") from None
+    if type(value) is not expected:
+        raise ValueError(f"{field.name} must be of type {expected.__name__}, got {value!r}")
+    return value
+
+
+def yaml_text(node_name: str, kinds: tuple[type, ...]) -> str:
+    """A parameter file with every setting at its default, its description, unit, range and choices above it."""
+    lines = [
+        f"# Parameters of {node_name} and their defaults. Written by `python -m bayes3d_ros.ros.parameters`;",
+        "# a test compares this file with the settings' dataclasses.",
+        f"/**/{node_name}:",
+        "  ros__parameters:",
+    ]
+    for kind in kinds:
+        for field in fields(kind):
+            comment = f"{field.metadata['description']}{_limits(field)}"
+            lines += [f"    # {line}" for line in textwrap.wrap(comment, 110)]
+            value = parameter_value(field)
+            lines.append(f"    {field.name}: {yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}")
+    return "\n".join(lines) + "\n"
+
+
+def _limits(field: Field) -> str:
+    meta, parts = field.metadata, []
+    if meta["unit"]:
+        parts.append(meta["unit"])
+    if meta["choices"]:
+        parts.append(" | ".join(meta["choices"]))
+    if meta["low"] is not None:
+        parts.append(f">= {meta['low']}")
+    if meta["high"] is not None:
+        parts.append(f"<= {meta['high']}")
+    return f" ({', '.join(parts)})" if parts else ""
+
+
+if __name__ == "__main__":
+    sys.stdout.write(yaml_text("scene_parser", SCENE_PARSER_SETTINGS))

@@ -1,0 +1,57 @@
+"""Everything the scene parser publishes of a scene."""
+
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray
+from rclpy.lifecycle import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.summaries import summarise
+from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.detections import detection_array, detections_type
+from bayes3d_ros.ros.markers import SceneMarkers
+from bayes3d_ros.ros.summary import summary_message
+
+_RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class ScenePublishers:
+    """The output topics. Publishes from any thread; nothing goes out unless the node is active."""
+
+    def __init__(self, node: Node) -> None:
+        def publisher(kind: Any, name: str, qos: QoSProfile = _RELIABLE) -> Any:
+            return node.create_lifecycle_publisher(kind, f"~/{name}", qos)
+
+        self._poses = publisher(PoseArray, "poses")
+        self._objects = publisher(MarkerArray, "objects")
+        self._segmentation = publisher(Image, "segmentation")
+        self._reconstruction = publisher(Image, "depth_reconstruction")
+        self._posterior = publisher(PointCloud2, "posterior")
+        self._summary = publisher(DiagnosticArray, "summary")
+        self._library = publisher(String, "library", _LATCHED)
+        detections = detections_type()
+        self._detections = None if detections is None else publisher(detections, "detections")
+
+    def library(self, library: Library) -> None:
+        """Publish the names of the types."""
+        self._library.publish(conversions.library_message(library.names))
+
+    def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers, min_probability: float) -> None:
+        """Publish a scene on every topic."""
+        summary = summarise(posterior.samples, posterior.types, min_probability, library)
+        self._poses.publish(conversions.pose_array(posterior))
+        self._segmentation.publish(conversions.segmentation_image(posterior))
+        self._reconstruction.publish(conversions.reconstruction_image(posterior))
+        self._posterior.publish(conversions.posterior_cloud(posterior, summary.object_index))
+        if self._objects.get_subscription_count():  # thousands of points as Python objects
+            self._objects.publish(markers(posterior))
+        if self._detections is not None:
+            self._detections.publish(detection_array(posterior, library))
+        self._summary.publish(summary_message(posterior))

@@ -1,0 +1,315 @@
+"""The scene_parser node: depth images in, posteriors over scenes out."""
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import jax
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from bayes3d_ros.inference.scene_parsing import SceneParser
+from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.model.objects import Library, LibraryError, load_library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ParseError, ScenePosterior
+from bayes3d_ros.ros.conversions import frame_from_messages
+from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
+from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, why_no_input
+from bayes3d_ros.ros.markers import SceneMarkers
+from bayes3d_ros.ros.parameters import (
+    FIXED_WHILE_ACTIVE,
+    SCENE_PARSER_SETTINGS,
+    SceneParserNodeSettings,
+    SettingsParameters,
+)
+from bayes3d_ros.ros.publishers import ScenePublishers
+from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.worker import NewestWorker
+
+_PARSER_PARAMETERS = tuple(f.name for f in fields(ParserSettings))
+
+
+class Parser(Protocol):
+    """What the node needs of a parser."""
+
+    library: Library
+    settings: ParserSettings
+
+    def warm_up(self, width: int, height: int) -> None: ...
+
+    def parse(self, frame: DepthFrame) -> ScenePosterior: ...
+
+
+class Ready(NamedTuple):
+    """A compiled parser and what goes with its library."""
+
+    parser: Parser
+    markers: SceneMarkers
+
+
+class SceneParserNode(Node):
+    """Lifecycle: configure loads the library and compiles, activate subscribes. With `autostart` it does both itself,
+    compiling on the worker's thread so that it can say meanwhile what it is doing.
+    """
+
+    def __init__(self, make_parser: Callable[[Library, ParserSettings], Parser] = SceneParser) -> None:
+        super().__init__("scene_parser")
+        self._make_parser = make_parser
+        self._health = Health()
+        self._settings = SettingsParameters(self, SCENE_PARSER_SETTINGS)
+        self._ready: Ready | None = None  # replaced as a whole; the worker reads it once a frame
+        self._inputs: DepthInputs | None = None
+        self._preparing_since: float | None = None
+        self._requests = 0
+        self._dropped_before = 0
+        self._refusal = ""
+        self._outputs = ScenePublishers(self)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._worker: NewestWorker[DepthMessages] = NewestWorker(self._process, self._worker_failed)
+        self._prepared = self.create_guard_condition(self._on_prepared)
+        self.create_service(Trigger, "~/reload_library", self._on_reload)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.add_post_set_parameters_callback(self._after_set_parameters)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
+        self.create_timer(0.05, self._tick, clock=steady)
+        self.create_timer(1.0, self._report, clock=steady)
+        if self.get_parameter("autostart").value:
+            self._prepare()
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the library and compile, unless that has been done already."""
+        try:
+            if self._ready is None:
+                self._ready = self._build(*self._load())
+        except (ValueError, LibraryError) as error:
+            self._refuse(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self._refuse(f"cannot compile the parser: {_one_line(error)}")
+            self.get_logger().debug(traceback.format_exc())
+            return TransitionCallbackReturn.FAILURE
+        self._refusal = ""
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe and publish."""
+        assert self._ready is not None
+        result = super().on_activate(state)
+        self._open_inputs()
+        self._outputs.library(self._ready.parser.library)
+        types = len(self._ready.parser.library.models)
+        self.get_logger().info(f"active, {types} object types, inference on {self._health.backend or 'unknown'}")
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening."""
+        self._close_inputs()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the parser."""
+        self._ready = None
+        self._requests += 1  # a parser on its way is not wanted any more
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening, for good."""
+        self._close_inputs()
+        return super().on_shutdown(state)
+
+    def stop(self, timeout: float) -> bool:
+        """Stop the worker; False if it is in the middle of something longer than `timeout` seconds."""
+        return self._worker.stop(timeout)
+
+    # Preparing a parser
+
+    def _load(self) -> tuple[Library, ParserSettings]:
+        """The library and settings that the parameters name. Raises ValueError, LibraryError."""
+        node_settings = self._settings.read(SceneParserNodeSettings)
+        settings = self._settings.read(ParserSettings)
+        if not node_settings.library:
+            raise ValueError("parameter library is not set: expected a folder of object models (bayes3d import)")
+        return load_library(Path(node_settings.library).expanduser()), settings
+
+    def _build(self, library: Library, settings: ParserSettings) -> Ready:
+        """Compile; takes seconds to minutes."""
+        parser = self._make_parser(library, settings)
+        size = [int(self.get_parameter(f"warm_up_{side}").value) for side in ("width", "height")]
+        if all(size):
+            parser.warm_up(*size)
+        self._health.backend = jax.default_backend()
+        return Ready(parser, SceneMarkers(library))
+
+    def _prepare(self) -> str:
+        """Have the worker build a parser from the parameters as they are now; what is wrong, or empty."""
+        try:
+            library, settings = self._load()
+        except (ValueError, LibraryError) as error:
+            if self._ready is None:
+                self._refuse(str(error))
+            return str(error)
+        self._requests += 1
+        request = self._requests
+        self._preparing_since = time.monotonic()
+        self._refusal = ""
+        self.get_logger().info(f"preparing a parser for {len(library.models)} object types")
+
+        def job() -> None:
+            if request != self._requests:
+                return  # a later request is on its way
+            try:
+                self._ready = self._build(library, settings)
+            except Exception as error:
+                self._refusal = f"cannot compile the parser: {_one_line(error)}"
+                self.get_logger().debug(traceback.format_exc())
+            self._prepared.trigger()
+
+        self._worker.call(job)
+        return ""
+
+    def _on_prepared(self) -> None:
+        """Runs on the executor when the worker has built a parser, or failed to."""
+        seconds = time.monotonic() - (self._preparing_since or time.monotonic())
+        self._preparing_since = None
+        state = self._state_label()
+        if self._refusal:
+            self.get_logger().error(self._refusal)
+            return
+        self.get_logger().info(f"parser ready after {seconds:.1f} s")
+        if state == "active" and self._ready is not None:
+            self._outputs.library(self._ready.parser.library)
+        elif (
+            state == "unconfigured"
+            and self.get_parameter("autostart").value
+            and self.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        ):
+            self.trigger_activate()
+
+    def _on_reload(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Load the library again; frames wait while it is compiled for, and a wrong one leaves the old in service."""
+        problem = self._prepare()
+        response.success = not problem
+        response.message = problem or "library loaded; frames wait until it is compiled for"
+        return response
+
+    def _refuse(self, why: str) -> None:
+        self._refusal = why
+        self.get_logger().error(f"{why}; correct it, then call ~/reload_library or configure again")
+
+    # Parameters
+
+    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        if self._inputs is not None:
+            fixed = [p.name for p in parameters if p.name in FIXED_WHILE_ACTIVE]
+            if fixed:
+                return SetParametersResult(successful=False, reason=f"{fixed[0]}: deactivate the node first")
+        return self._settings.check(parameters)
+
+    def _after_set_parameters(self, parameters: list[Parameter]) -> None:
+        if self._ready is not None and any(p.name in _PARSER_PARAMETERS for p in parameters):
+            self._prepare()
+        if self._inputs is not None and any(p.name in ("camera_pose", "table") for p in parameters):
+            self._close_inputs()
+            self._open_inputs()
+
+    # Frames
+
+    def _open_inputs(self) -> None:
+        assert self._ready is not None
+        settings = self._settings.read(SceneParserNodeSettings)
+        self._inputs = DepthInputs(
+            self,
+            self._worker.submit,
+            reliability=settings.qos_reliability,
+            table_frame=settings.table_frame,
+            fixed_pose=settings.camera_pose,
+            use_pose=self._settings.read(ParserSettings).table != "depth",
+            patience=settings.patience,
+        )
+
+    def _close_inputs(self) -> None:
+        if self._inputs is not None:
+            self._dropped_before += self._inputs.dropped
+            self._inputs.close()
+            self._inputs = None
+        self._worker.forget()
+
+    def _tick(self) -> None:
+        if self._inputs is not None:
+            self._inputs.tick()
+
+    def _process(self, messages: DepthMessages) -> None:
+        """On the worker's thread: one frame from messages to messages."""
+        ready = self._ready
+        if ready is None or self._inputs is None:
+            return
+        try:
+            frame = frame_from_messages(messages.image, messages.info, messages.T_table_camera)
+            posterior = ready.parser.parse(frame)
+        except (ValueError, ParseError) as error:
+            self._problem(_one_line(error, named=False))
+            return
+        self._outputs.scene(posterior, ready.parser.library, ready.markers, ready.parser.settings.min_probability)
+        self._health.output(posterior, time.monotonic() - messages.arrived)
+
+    def _worker_failed(self, error: Exception) -> None:
+        self._problem(f"internal error, please report it: {_one_line(error)}")
+        self.get_logger().debug("".join(traceback.format_exception(error)))
+
+    def _problem(self, text: str) -> None:
+        if self._health.problem(text):
+            self.get_logger().warning(f"no output: {text}")
+
+    # Diagnostics
+
+    def _state_label(self) -> str:
+        return str(self._state_machine.current_state[1])
+
+    def _report(self) -> None:
+        inputs = self._inputs
+        dropped = self._dropped_before + self._worker.dropped + (inputs.dropped if inputs else 0)
+        level, message = self._why()
+        notes = inputs.notes() if inputs else ""
+        name = f"{self.get_fully_qualified_name()}: scene parsing"
+        self._diagnostics.publish(self._health.report(name, level, message, self._state_label(), dropped, notes))
+
+    def _why(self) -> tuple[bytes, str]:
+        """The level and the one line that says whether there is output, and if not, why."""
+        if self._refusal:
+            return ERROR, self._refusal
+        if self._preparing_since is not None:
+            return WARN, f"compiling for the library, {time.monotonic() - self._preparing_since:.0f} s so far"
+        if self._inputs is None:
+            return WARN, f"the node is {self._state_label()}; configure and activate it"
+        silent = why_no_input(self._inputs.view())
+        problem = self._health.recent_problem()
+        if silent or problem:
+            return WARN, silent or problem
+        return OK, "parsing" if self._health.parsed else "the first frame is being parsed"
+
+
+def _one_line(error: Exception, named: bool = True) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if named else text
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
+    return run(SceneParserNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,43 @@
+"""Run a node until it is told to stop; every end is a clean one."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Protocol, cast
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+
+class StoppableNode(Protocol):
+    """A node with threads of its own."""
+
+    def stop(self, timeout: float) -> bool:
+        """Stop all work; False if something was still running after `timeout` seconds."""
+        ...
+
+
+def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
+    """Spin a node until SIGINT, SIGTERM or a shutdown of ROS; the exit status is 0 for all of them."""
+    node = None
+    stopped = True
+    try:
+        rclpy.init(args=args)
+        node = make_node()
+        rclpy.spin(cast(Node, node))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean end short
+        if node is not None:
+            stopped = node.stop(timeout=2.0)
+            cast(Node, node).destroy_node()
+        rclpy.try_shutdown()
+    if not stopped:
+        # A compilation or a long frame cannot be interrupted, and the interpreter must not be torn down under it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+    return 0

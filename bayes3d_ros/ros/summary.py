@@ -1,0 +1,48 @@
+"""A scene as people read it with `ros2 topic echo`: what stands where, how sure, and what the sampler did."""
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
+from bayes3d_ros.ros.conversions import header
+
+
+def key_values(**values: str) -> list[KeyValue]:
+    """Key-value pairs in the order given; underscores in keys are read as spaces."""
+    return [KeyValue(key=key.replace("_", " "), value=value) for key, value in values.items()]
+
+
+def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
+    """One status for the scene, then one per object, in the order of their labels."""
+    names = ", ".join(o.type for o in posterior.objects) or "no object"
+    scene = DiagnosticStatus(name="scene", hardware_id=posterior.frame_id, message=names)
+    scene.values = key_values(
+        p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
+        log_evidence=f"{posterior.log_evidence:.2f}",
+        p_outlier=f"{posterior.p_outlier:.4f}",
+        sigma_mm=f"{posterior.sigma * 1e3:.3f}",
+        ess=" ".join(f"{e:.2f}" for e in posterior.ess),
+        ms=f"{posterior.seconds * 1e3:.0f}",
+    ) + [KeyValue(key="note", value=note) for note in posterior.notes]
+    objects = [_object_status(k, o, posterior.frame_id) for k, o in enumerate(posterior.objects, start=1)]
+    return DiagnosticArray(header=header(posterior), status=[scene, *objects])
+
+
+def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> DiagnosticStatus:
+    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    status = DiagnosticStatus(name=f"{label} {estimate.type}", hardware_id=frame_id)
+    status.message = f"p(exists) {estimate.probability:.3f}"
+    status.values = key_values(
+        p_exists=f"{estimate.probability:.4f}",
+        p_type=" ".join(f"{name}: {p:.3f}" for name, p in estimate.type_probabilities.items()),
+        position_m=_numbers(estimate.position, 4),
+        orientation_xyzw=_numbers(estimate.orientation, 4),
+        sigma_position_mm=_numbers(sigma[:3] * 1e3, 2),
+        sigma_rotation_deg=_numbers(np.degrees(sigma[3:]), 2),
+        contact_face=str(estimate.contact_face),
+    )
+    return status
+
+
+def _numbers(values: np.ndarray, digits: int) -> str:
+    return " ".join(f"{v:.{digits}f}" for v in values)
