@@ -1,0 +1,248 @@
+"""The `bayes3d` command. Exit status: 0, 1 (failed), 2 (bad usage or input: one line on stderr)."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import bayes3d_ros
+
+if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
+    from bayes3d_ros.bags import FrameReader
+    from bayes3d_ros.inference.settings import ParserSettings
+    from bayes3d_ros.model.objects import Library
+    from bayes3d_ros.model.posterior import ScenePosterior
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+ANY = click.Path(path_type=Path)
+
+
+class InputError(click.ClickException):
+    """Bad input: one line that names the file, topic or field and says what was expected."""
+
+    exit_code = 2
+
+
+class _OneLineErrors(click.Group):
+    """Turns the package's own errors, which are one line each, into exit status 1 or 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.Abort, click.exceptions.Exit):
+            raise
+        except KeyboardInterrupt:
+            raise click.ClickException("interrupted; what was finished is kept") from None
+        except OSError as error:
+            raise click.ClickException(f"{error.filename or 'input or output'}: {error.strerror or error}") from error
+        except Exception as error:
+            if isinstance(error, _input_errors()):
+                raise InputError(" ".join(str(error).split())) from error
+            raise
+
+
+def _input_errors() -> tuple[type[Exception], ...]:
+    from bayes3d_ros.evaluation.results import ResultsError
+    from bayes3d_ros.evaluation.scene_file import SimulationError
+    from bayes3d_ros.geometry.mesh import MeshError
+    from bayes3d_ros.mcap_files import BagError
+    from bayes3d_ros.model.objects import LibraryError
+
+    return BagError, LibraryError, MeshError, ResultsError, SimulationError
+
+
+@click.group(cls=_OneLineErrors, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(bayes3d_ros.__version__, package_name="bayes3d_ros")
+def main() -> None:
+    """Posteriors over 3D tabletop scenes from depth images."""
+
+
+def _device_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option(
+        "--device",
+        type=click.Choice(["cpu", "gpu"]),
+        callback=lambda ctx, parameter, value: _choose_device(value),
+        expose_value=False,
+        help="Where to compute; default: a GPU where JAX finds one.",
+    )(command)
+
+
+def _choose_device(device: str | None) -> None:
+    """Before jax is imported. Does not take most of a GPU's memory from the other programs of a robot."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if device == "cpu":
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    elif device == "gpu":
+        os.environ.pop("JAX_PLATFORMS", None)
+        import jax
+
+        try:
+            jax.devices("gpu")
+        except RuntimeError:
+            raise InputError(
+                "--device gpu: expected a GPU that JAX can use, it finds none (pip install 'jax[cuda12]')"
+            ) from None
+
+
+@main.command()
+@click.argument("bag", type=ANY)
+@click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
+@click.option("--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz and frames/.")
+@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--table", type=click.Choice(["auto", "pose", "depth"]), help="Where the table's plane comes from.")
+@click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
+@click.option("--particles", type=int, help="Scenes carried by the sampler.")
+@click.option("--max-objects", type=int, help="Most objects a scene may hold.")
+@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
+@_device_option
+def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
+    """Parse every depth frame of BAG into a posterior over scenes."""
+    from bayes3d_ros.bags import read_frames
+    from bayes3d_ros.model.objects import load_library
+
+    settings = _parser_settings(more, options)
+    models = load_library(library)
+    frames = read_frames(bag, topic)
+    done, failed = _parse_frames(frames, models, settings, out)
+    if failed and not done:
+        raise click.ClickException(f"{bag}: none of the {failed} frames could be parsed")
+    click.echo(f"{done} frames parsed" + (f", {failed} could not be" if failed else "") + f"; results in {out}")
+
+
+def _parser_settings(more: tuple[str, ...], options: dict[str, Any]) -> "ParserSettings":
+    from dataclasses import fields
+
+    from bayes3d_ros.inference.settings import ParserSettings
+
+    kinds = {f.name: type(f.default) for f in fields(ParserSettings)}
+    chosen = {name: value for name, value in options.items() if value is not None}
+    for text in more:
+        name, _, value = text.partition("=")
+        if name not in kinds:
+            raise InputError(f"--set {text}: expected one of {', '.join(kinds)}")
+        try:
+            chosen[name] = _BOOLEANS[value.lower()] if kinds[name] is bool else kinds[name](value)
+        except (ValueError, KeyError):
+            raise InputError(f"--set {text}: expected {name}={kinds[name].__name__}") from None
+    try:
+        return ParserSettings(**chosen)
+    except ValueError as error:
+        raise InputError(f"settings: {error}") from error
+
+
+_BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+
+
+def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSettings", out: Path) -> tuple[int, int]:
+    """How many frames were parsed, and how many could not be."""
+    from bayes3d_ros.evaluation.plots import plot_scene
+    from bayes3d_ros.evaluation.results import ResultsWriter
+    from bayes3d_ros.inference.compilation import enable_cache
+    from bayes3d_ros.inference.scene_parsing import SceneParser
+    from bayes3d_ros.model.posterior import ParseError
+    from bayes3d_ros.model.summaries import summarise
+
+    enable_cache()
+    parser = SceneParser(library, settings)
+    failed, size = 0, None
+    with ResultsWriter(out, library.names) as results:
+        for frame in _progress(frames, len(frames), "frame"):
+            camera = frame.intrinsics
+            if size != (camera.width, camera.height):  # so that `seconds` are those of a running system
+                size = camera.width, camera.height
+                parser.warm_up(*size)
+            try:
+                posterior = parser.parse(frame)
+            except ParseError as error:
+                failed += 1
+                _say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+                continue
+            summary = summarise(posterior.samples, posterior.types, settings.min_probability, library)
+            picture = results.write(frame.depth, posterior, summary.object_index)
+            title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
+            plot_scene(frame.depth, posterior, picture, title, camera)
+            _say(_frame_line(posterior))
+        return results.frames, failed
+
+
+def _frame_line(posterior: "ScenePosterior") -> str:
+    found = ", ".join(f"{o.type} {o.probability:.2f}" for o in posterior.objects) or "no object"
+    return f"{posterior.stamp_ns}  {posterior.seconds:.2f} s  {found}"
+
+
+@main.command(name="import")
+@click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FILE)
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
+@click.option("--voxel-size", type=click.FloatRange(0, min_open=True), default=0.003, show_default=True, help="Metres.")
+def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float) -> None:
+    """Make object models from meshes in metres; a model is named after its file."""
+    from bayes3d_ros.model.mesh_import import import_meshes
+
+    for done in _progress(import_meshes(meshes, library, voxel_size), len(meshes), "mesh"):
+        _say(f"{done.model}  {done.model.stat().st_size / 1000:.1f} kB")
+        if done.warning:
+            _say(f"{done.mesh}: {done.warning}", err=True)
+
+
+@main.command()
+@click.argument("scene", metavar="SCENE.yaml", type=FILE)
+@click.option("--out", required=True, type=FOLDER, help="Bag to write; a new folder.")
+def simulate(scene: Path, out: Path) -> None:
+    """Record a simulated depth bag with ground truth."""
+    from tqdm import tqdm
+
+    from bayes3d_ros.evaluation.simulation import simulate as record
+
+    with tqdm(unit="frame", disable=None, leave=False) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        record(scene, out, progress)
+    click.echo(f"{out}")
+
+
+@main.command()
+@click.option("--json", "file", type=FILE, help="Also write the rows, the machine and the versions to this file.")
+@_device_option
+def bench(file: Path | None) -> None:
+    """Measure how fast this machine is."""
+    import json
+
+    from bayes3d_ros.evaluation import benchmark
+    from bayes3d_ros.inference.compilation import enable_cache
+
+    enable_cache()
+    report: dict[str, Any] = {"machine": benchmark.machine(), "versions": benchmark.versions(), "rows": []}
+    for key, value in (report["machine"] | report["versions"]).items():
+        click.echo(f"{key:<12} {value}")
+    click.echo(benchmark.HEADER)
+    for row in _progress(benchmark.rows(), benchmark.count(), "row"):
+        report["rows"].append(row)
+        _say(benchmark.line(row))
+        if file is not None:  # after every row: an interrupted run leaves what it measured
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _progress(items: Any, total: int, unit: str) -> "Iterator[Any]":
+    """With a bar on stderr where that is a terminal."""
+    from tqdm import tqdm
+
+    return iter(tqdm(items, total=total, unit=unit, disable=None, leave=False))
+
+
+def _say(text: str, err: bool = False) -> None:
+    """A line that leaves the progress bar whole."""
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode():
+        click.echo(text, err=err)
+
+
+if __name__ == "__main__":
+    main()

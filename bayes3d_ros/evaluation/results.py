@@ -1,0 +1,137 @@
+"""Files of a parsed recording: scenes.jsonl, samples.npz and frames/STAMP_NS.npz (docs/outputs.md describes them)."""
+
+import json
+import os
+import re
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.lib import format as npy
+
+from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
+from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, posterior_rows
+
+SCENES, SAMPLES, FRAMES = "scenes.jsonl", "samples.npz", "frames"
+
+
+class ResultsError(Exception):
+    """Results that cannot be written; one line naming the file."""
+
+
+def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
+    """The line of scenes.jsonl, as JSON values. What is not a finite number is null."""
+    height, width = posterior.segmentation.shape
+    return {
+        "stamp_ns": int(posterior.stamp_ns),
+        "frame_id": posterior.frame_id,
+        "size": [width, height],
+        "seconds": round(float(posterior.seconds), 4),
+        "log_evidence": _number(posterior.log_evidence),
+        "num_objects": {str(n): _number(p) for n, p in posterior.num_objects.items()},
+        "noise": {"p_outlier": _number(posterior.p_outlier), "sigma": _number(posterior.sigma)},
+        "objects": [_object_record(found) for found in posterior.objects],
+        "T_camera_table": _numbers(posterior.T_camera_table),
+        "ess": _numbers(posterior.ess),
+        "notes": list(posterior.notes),
+    }
+
+
+def _object_record(found: ObjectEstimate) -> dict[str, Any]:
+    return {
+        "type": found.type,
+        "type_probabilities": {name: _number(p) for name, p in found.type_probabilities.items()},
+        "probability": _number(found.probability),
+        "position": _numbers(found.position),
+        "orientation": _numbers(found.orientation),
+        "covariance": _numbers(found.covariance),
+        "contact_face": int(found.contact_face),
+    }
+
+
+class ResultsWriter:
+    """Writes the results of one recording into a folder; a context manager.
+
+    Whatever ends the run, even a kill, scenes.jsonl holds whole lines of whole frames; samples.npz is written on
+    leaving the context, from rows kept on disk until then. Results that an earlier run left in the folder are
+    replaced. The same posteriors give the same bytes, `seconds` aside.
+    """
+
+    def __init__(self, folder: Path, types: Sequence[str]) -> None:
+        self.folder, self.types = Path(folder), tuple(types)
+        self.frames = 0
+
+    def __enter__(self) -> "ResultsWriter":
+        try:
+            (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
+            if (self.folder / SCENES).exists():  # an earlier run's frames would look like this one's
+                for path in (self.folder / FRAMES).iterdir():
+                    if re.fullmatch(r"\d+\.(npz|png)", path.name):
+                        path.unlink()
+                (self.folder / SAMPLES).unlink(missing_ok=True)
+            self._scenes = (self.folder / SCENES).open("w")
+            self._rows = (self.folder / f".{SAMPLES}.rows").open("w+b")
+        except OSError as error:
+            raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
+        return self
+
+    def write(
+        self,
+        depth: Float[np.ndarray, "height width"],
+        posterior: ScenePosterior,
+        object_index: Int[np.ndarray, "S M"],
+    ) -> Path:
+        """Append a frame; depth is what was parsed, in metres. Returns where the frame's PNG belongs."""
+        try:
+            path = self.folder / FRAMES / f"{posterior.stamp_ns}.npz"
+            arrays = {
+                "depth": np.asarray(depth, np.float32),
+                "reconstruction": np.asarray(posterior.reconstruction, np.float32),
+                "segmentation": np.asarray(posterior.segmentation, np.uint16),
+            }
+            temporary = path.with_name(f".{path.name}.tmp")
+            with temporary.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+            os.replace(temporary, path)
+            rows = posterior_rows(posterior.samples, object_index)
+            framed = np.zeros(len(rows), _ROW)
+            for name in rows.dtype.names:
+                framed[name] = rows[name]
+            framed["frame"] = self.frames
+            self._rows.write(framed.tobytes())
+            self._scenes.write(json.dumps(scene_record(posterior), allow_nan=False) + "\n")
+            self._scenes.flush()
+        except OSError as error:
+            raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
+        self.frames += 1
+        return path.with_suffix(".png")
+
+    def __exit__(self, *error: Any) -> None:
+        self._scenes.close()
+        self._rows.flush()
+        rows = np.memmap(self._rows, _ROW, "r") if self._rows.tell() else np.zeros(0, _ROW)
+        temporary = self.folder / f".{SAMPLES}.tmp"
+        # Column by column: a long recording's samples need not fit into memory.
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            columns = {name: rows[name] for name in _ROW.names or ()} | {"types": np.array(self.types, "U")}
+            for name, column in columns.items():
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
+                    npy.write_array(file, np.ascontiguousarray(column), allow_pickle=False)
+        os.replace(temporary, self.folder / SAMPLES)
+        self._rows.close()
+        Path(self._rows.name).unlink()
+
+
+_ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _numbers(values: Any) -> list[Any]:
+    values = np.asarray(values, float)
+    return [_number(v) if values.ndim == 1 else _numbers(v) for v in values]

@@ -1,0 +1,45 @@
+"""A picture is drawn whatever the posterior holds, without warnings."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from bayes3d_ros.evaluation.plots import COLOURS, colour, plot_scene
+
+TYPES = ("bowl", "can", "mug")
+
+
+@pytest.mark.parametrize("objects", [0, 1, 4])
+def test_a_picture_of_a_scene(tmp_path, depth_frame, fake_posterior, objects):
+    frame = depth_frame()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        path = plot_scene(
+            frame.depth, fake_posterior(frame, TYPES, objects), tmp_path / "a.png", "title", frame.intrinsics
+        )
+    assert imread(path).shape == (820, 1500, 4)
+
+
+def test_masks_have_the_colours_of_their_labels(tmp_path, depth_frame, fake_posterior):
+    frame = depth_frame()
+    pixels = imread(plot_scene(frame.depth, fake_posterior(frame, TYPES, 2), tmp_path / "a.png"))[..., :3]
+    left_below = pixels[450:, :500]  # the segmentation
+    for label in (1, 2):
+        wanted = np.array([int(colour(label)[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        assert (np.abs(left_below - wanted).max(-1) < 0.01).sum() > 1000
+
+
+def test_depth_without_a_single_return_and_empty_masks(tmp_path, depth_frame, fake_posterior):
+    frame = depth_frame()
+    posterior = fake_posterior(frame, TYPES)
+    hidden = replace(posterior, segmentation=np.zeros_like(posterior.segmentation))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plot_scene(np.full_like(frame.depth, np.nan), hidden, tmp_path / "a.png")
+
+
+def test_colours_are_told_apart():
+    assert len(set(COLOURS)) == len(COLOURS) and colour(1) == colour(1 + len(COLOURS))

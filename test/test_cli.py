@@ -1,0 +1,212 @@
+"""Exit codes, lines and files of the `bayes3d` command, with a stand-in for the parser."""
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner
+
+from bayes3d_ros import cli
+from bayes3d_ros.bags import BagWriter
+from bayes3d_ros.inference import scene_parsing
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import save_model
+from bayes3d_ros.model.posterior import ParseError
+
+
+@pytest.fixture
+def bag(tmp_path, depth_frame):
+    with BagWriter(tmp_path / "bag") as writer:
+        for stamp in (1, 2, 3):
+            writer.write(depth_frame(stamp))
+    return tmp_path / "bag"
+
+
+@pytest.fixture
+def library(tmp_path):
+    for name in ("block", "slab"):
+        save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), name, 0.01), tmp_path / "library")
+    return tmp_path / "library"
+
+
+@pytest.fixture
+def parsers(monkeypatch, fake_posterior):
+    """The parsers that were made; one fails on the stamps that are put into `failing`."""
+    made = []
+
+    class Parser:
+        failing: set = set()
+
+        def __init__(self, models, settings):
+            self.models, self.settings, self.warm = models, settings, []
+            made.append(self)
+
+        def warm_up(self, width, height):
+            self.warm.append((width, height))
+
+        def parse(self, frame):
+            if frame.stamp_ns in self.failing:
+                raise ParseError("no table in sight, expected one")
+            return fake_posterior(frame, self.models.names)
+
+    monkeypatch.setattr(scene_parsing, "SceneParser", Parser)
+    compilation = SimpleNamespace(enable_cache=lambda: None)
+    monkeypatch.setitem(sys.modules, "bayes3d_ros.inference.compilation", compilation)
+    return SimpleNamespace(made=made, failing=Parser.failing)
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.main, [str(a) for a in arguments])
+
+
+def assert_one_line(result, status, *words):
+    assert result.exit_code == status, result.output
+    (line,) = result.stderr.strip().splitlines()
+    for word in words:
+        assert str(word) in line
+    assert "Traceback" not in result.output
+
+
+def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
+    out = tmp_path / "out"
+    result = run("parse", bag, "--library", library, "--out", out)
+    assert result.exit_code == 0, result.output
+    lines = [json.loads(text) for text in (out / "scenes.jsonl").read_text().splitlines()]
+    assert [line["stamp_ns"] for line in lines] == [1, 2, 3]
+    assert set(np.load(out / "samples.npz")["frame"]) == {0, 1, 2}
+    assert sorted(path.name for path in (out / "frames").iterdir()) == [
+        f"{s}.{kind}" for s in (1, 2, 3) for kind in ("npz", "png")
+    ]
+    assert [parser.warm for parser in parsers.made] == [[(64, 48)]]  # compiled once, before the first frame
+    assert "3 frames parsed" in result.stdout and "block 0.86" in result.stdout
+
+
+def test_options_become_settings(bag, library, parsers, tmp_path):
+    options = [
+        "--table",
+        "depth",
+        "--seed",
+        "7",
+        "--particles",
+        "33",
+        "--max-objects",
+        "2",
+        "--set",
+        "sigma_max=0.004",
+        "--set",
+        "window=3",
+    ]
+    assert run("parse", bag, "--library", library, "--out", tmp_path / "out", *options).exit_code == 0
+    settings = parsers.made[0].settings
+    assert (settings.table, settings.seed, settings.particles, settings.max_objects) == ("depth", 7, 33, 2)
+    assert (settings.sigma_max, settings.window) == (0.004, 3)
+
+
+def test_a_frame_that_fails_is_told_and_the_others_go_out(bag, library, parsers, tmp_path):
+    parsers.failing.add(2)
+    result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
+    assert_one_line(result, 0, bag, "/depth/image_rect", "stamp 2", "no table in sight")
+    stamps = [json.loads(text)["stamp_ns"] for text in (tmp_path / "out" / "scenes.jsonl").read_text().splitlines()]
+    assert stamps == [1, 3]
+    assert set(np.load(tmp_path / "out" / "samples.npz")["frame"]) == {0, 1}
+
+
+def test_every_frame_failing_is_a_failure(bag, library, parsers, tmp_path):
+    parsers.failing.update({1, 2, 3})
+    result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    *reasons, last = result.stderr.strip().splitlines()
+    assert len(reasons) == 3 and all("no table in sight" in line for line in reasons)
+    assert "none of the 3 frames" in last
+
+
+def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers, tmp_path):
+    (file,) = bag.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-40])
+    result = run("parse", file, "--library", library, "--out", tmp_path / "out")
+    lines = (tmp_path / "out" / "scenes.jsonl").read_text().splitlines()
+    assert len(lines) == 3
+    assert_one_line(result, 2, file)
+
+
+@pytest.mark.parametrize(
+    ("option", "word"),
+    [
+        (["--particles", "0"], "particles"),
+        (["--set", "nonsense=1"], "nonsense"),
+        (["--set", "window=wide"], "window=int"),
+        (["--set", "window=4"], "odd"),
+        (["--topic", "/other"], "/depth/image_rect"),
+    ],
+)
+def test_bad_settings_and_topics(bag, library, parsers, tmp_path, option, word):
+    assert_one_line(run("parse", bag, "--library", library, "--out", tmp_path / "out", *option), 2, word)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_files_are_named(bag, library, parsers, tmp_path):
+    out, missing = ("--out", tmp_path / "out"), tmp_path / "missing"
+    assert_one_line(run("parse", missing, "--library", library, *out), 2, missing)
+    assert_one_line(run("parse", bag, "--library", missing, *out), 2, missing)
+    (library / "block.npz").write_bytes(b"no model")
+    assert_one_line(run("parse", bag, "--library", library, *out), 2, library / "block.npz")
+    (tmp_path / "file").write_text("")
+    save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01), library)
+    assert run("parse", bag, "--library", library, "--out", tmp_path / "file").exit_code == 2
+    assert_one_line(run("simulate", missing, "--out", tmp_path / "new"), 2, missing)
+    assert_one_line(run("import", missing, "--library", library), 2, missing)
+
+
+def test_no_gpu_is_one_line(bag, library, parsers, tmp_path, monkeypatch):
+    import jax
+
+    def none(kind):
+        raise RuntimeError(f"no {kind}")
+
+    monkeypatch.setattr(jax, "devices", none)
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    out = ("--library", library, "--out", tmp_path / "out")
+    assert_one_line(run("parse", bag, *out, "--device", "gpu"), 2, "--device gpu", "GPU")
+
+
+def test_device_cpu_is_chosen_before_jax(bag, library, parsers, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "")
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    arguments = ("--library", library, "--out", tmp_path / "out", "--device", "cpu")
+    assert run("parse", bag, *arguments).exit_code == 0
+    assert os.environ["JAX_PLATFORMS"] == "cpu"
+
+
+def test_an_interrupt_is_one_line_and_keeps_what_was_finished(bag, library, parsers, tmp_path, monkeypatch):
+    def interrupted(posterior):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_frame_line", interrupted)
+    result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
+    assert_one_line(result, 1, "interrupted")
+    assert len((tmp_path / "out" / "scenes.jsonl").read_text().splitlines()) == 1
+    assert (tmp_path / "out" / "samples.npz").exists()
+
+
+def test_import_names_models_after_files(tmp_path):
+    trimesh.creation.box((0.05, 0.04, 0.03)).export(tmp_path / "brick.stl")
+    library = tmp_path / "library"
+    result = run("import", tmp_path / "brick.stl", "--library", library, "--voxel-size", "0.01")
+    assert result.exit_code == 0, result.output
+    assert str(library / "brick.npz") in result.stdout
+    assert (library / "brick.npz").is_file()
+    assert run("import", tmp_path / "brick.stl", "--library", library, "--voxel-size", "0").exit_code == 2
+
+
+def test_help_does_not_load_what_is_heavy():
+    program = (
+        "import sys; from bayes3d_ros import cli; print([m for m in ('jax', 'numpy', 'scipy') if m in sys.modules])"
+    )
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert loaded.strip() == "[]"
