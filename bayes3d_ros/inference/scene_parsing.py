@@ -1,21 +1,245 @@
 """Parse one depth frame into a posterior over scenes."""
 
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.spatial.transform import Rotation
+
+from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, unproject
+from bayes3d_ros.inference import noise as noise_model
+from bayes3d_ros.inference import smc
+from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.inference.table import find_plane, table_frame, workspace
+from bayes3d_ros.model.library_arrays import library_arrays
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.posterior import ParseError, SceneSamples, ScenePosterior
+from bayes3d_ros.model.rendering import renderers
+from bayes3d_ros.model.scene_graph import Contact, Table, T_camera_object
+from bayes3d_ros.model.scene_score import Image
+from bayes3d_ros.model.summaries import summarise
+
+_NEGLIGIBLE = np.log(1e-4)  # a number of objects this much less likely than the best ends the search for more
+
+
+class _Stage(NamedTuple):
+    """What is kept of the scenes of k objects."""
+
+    objects: Contact
+    log_weight: Float[np.ndarray, "N"]
+    p_outlier: Float[np.ndarray, "N"]
+    sigma: Float[np.ndarray, "N"]
+    log_evidence: float
 
 
 class SceneParser:
-    """Holds a library and compiled code; keeps no state between frames."""
+    """Holds a library and compiled code; keeps no state between frames.
+
+    The image is scored at `settings.score_width` pixels across; reconstruction and segmentation have the input's size.
+    """
 
     def __init__(self, library: Library, settings: ParserSettings = ParserSettings()) -> None:
         self.library, self.settings = library, settings
+        self._arrays = library_arrays(library)
+        self._grid = noise_model.noise_grid(settings.sigma_max)
+        self._table_size = (settings.table_width, settings.table_depth)
+        self._sample_noise = jax.jit(noise_model.sample)
+        self._cast = jax.jit(renderers["march"])
 
     def warm_up(self, width: int, height: int) -> None:
-        """Compile for images of this size (values of the intrinsics do not matter)."""
-        raise NotImplementedError
+        """Compile for images of this size (values of the intrinsics do not matter) by parsing a synthetic frame."""
+        intrinsics = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
+        rays = intrinsics.rays()
+        tilt = np.float32(0.6)
+        depth = 0.8 / np.maximum(rays[..., 1] * np.cos(tilt) + np.sin(tilt), 0.2)
+        nothing = max(self.settings.max_objects, 0)
+        if nothing:
+            middle = slice(height // 2 - height // 16, height // 2 + height // 16)
+            depth[middle, width // 2 - width // 16 : width // 2 + width // 16] *= 0.9
+        self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up"))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
         """The posterior given one frame. Raises ParseError with one clear line when there is none."""
-        raise NotImplementedError
+        start = time.perf_counter()
+        settings = self.settings
+        image, table, T_camera_table, notes = self._observe(frame)
+        context = Context(image, self._arrays, table)
+        stages, ess = self._sample(_frame_key(settings.seed, frame.stamp_ns), context)
+        samples, log_evidence = self._mix(stages, table)
+        summary = summarise(samples, self.library.names, settings.min_probability, self.library)
+        reconstruction, segmentation = self._reconstruct(frame, T_camera_table, samples, summary)
+        return ScenePosterior(
+            stamp_ns=frame.stamp_ns,
+            frame_id=frame.frame_id,
+            types=self.library.names,
+            objects=summary.objects,
+            num_objects=summary.num_objects,
+            p_outlier=summary.p_outlier,
+            sigma=summary.sigma,
+            log_evidence=log_evidence,
+            samples=samples,
+            object_index=summary.object_index,
+            reconstruction=reconstruction,
+            segmentation=segmentation,
+            T_camera_table=T_camera_table,
+            ess=tuple(ess),
+            seconds=time.perf_counter() - start,
+            notes=tuple(notes),
+        )
+
+    def _observe(self, frame: DepthFrame) -> tuple[Image, Table, Float[np.ndarray, "4 4"], list[str]]:
+        """The image at scoring resolution, and the table in it."""
+        settings = self.settings
+        width = min(settings.score_width, frame.intrinsics.width)
+        height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
+        camera = frame.intrinsics.resized(width, height)
+        depth = resize_depth(frame.depth, width, height)
+        with np.errstate(invalid="ignore"):
+            returned = np.isfinite(depth) & (depth >= settings.near) & (depth <= settings.far)
+        if not returned.any():
+            raise ParseError(
+                f"the depth image has no return between {settings.near} and {settings.far} m "
+                f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
+            )
+        points = unproject(np.where(returned, depth, np.nan), camera)
+        T_camera_table, notes = self._find_table(frame, points[returned])
+        inside = returned & workspace(points, T_camera_table, self._table_size, settings.workspace_height)
+        kind = np.where(inside, IN_WORKSPACE, np.where(returned, BEYOND, NO_RETURN))
+        rays = camera.rays()
+        normal = T_camera_table[:3, 2]
+        facing = rays @ normal
+        with np.errstate(divide="ignore"):
+            bare = (normal @ T_camera_table[:3, 3]) / facing
+        bare = np.where((facing < -1e-3) & (bare > 0) & (bare < settings.far) & (kind != BEYOND), bare, np.inf)
+        image = Image(
+            depth=jnp.asarray(np.where(returned, depth, 0.0), jnp.float32),
+            kind=jnp.asarray(kind, jnp.int32),
+            ray_x=jnp.asarray(rays[0, :, 0]),
+            ray_y=jnp.asarray(rays[:, 0, 1]),
+            focal=jnp.array([camera.fx, camera.fy], jnp.float32),
+            centre=jnp.array([camera.cx, camera.cy], jnp.float32),
+            table=jnp.asarray(bare, jnp.float32),
+            outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
+            front_margin=jnp.float32(3 * settings.sigma_max),
+        )
+        table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
+        return image, table, T_camera_table, notes
+
+    def _find_table(
+        self, frame: DepthFrame, points: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "4 4"], list[str]]:
+        source = self.settings.table
+        if source != "depth" and frame.T_table_camera is not None:
+            return np.linalg.inv(frame.T_table_camera), []
+        if source == "pose":
+            raise ParseError("no camera pose for this frame, and table:=pose expects one")
+        return table_frame(find_plane(points), points), ["table found in the depth image"]
+
+    def _sample(self, key: PRNGKeyArray, context: Context) -> tuple[list[_Stage], list[float]]:
+        """Stages of the sampler, from the empty table to more objects than the image bears out."""
+        settings = self.settings
+        fixed = settings.fixed_objects >= 0
+        last = settings.fixed_objects if fixed else settings.max_objects
+        state = smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
+        stages, ess = [self._keep(key, state)], []
+        log_mass = [0.0]
+        for count in range(last):
+            state, info = smc.step(
+                jax.random.fold_in(key, count),
+                state,
+                jnp.int32(count),
+                context,
+                self._grid,
+                self._table_size,
+                settings.window,
+                settings.ess_threshold,
+            )
+            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), state))
+            ess.append(float(info.ess))
+            log_mass.append(stages[-1].log_evidence + (count + 1) * np.log(settings.count_ratio))
+            if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
+                break
+        if fixed:
+            if len(stages) != settings.fixed_objects + 1 or not np.isfinite(stages[-1].log_evidence):
+                raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
+            stages = stages[-1:]
+        return stages, ess
+
+    def _keep(self, key: PRNGKeyArray, state: smc.State) -> _Stage:
+        noise = self._sample_noise(key, state.table, self._grid)
+        return jax.device_get(
+            _Stage(state.objects, state.log_weight, noise.p_outlier, noise.sigma, state.log_evidence)
+        )
+
+    def _mix(self, stages: list[_Stage], table: Table) -> tuple[SceneSamples, float]:
+        """The mixture over the number of objects, p(n | image) ~ P(n) Z_n; and log p(image) / p(image | empty table)."""
+        counts = np.arange(len(stages)) if self.settings.fixed_objects < 0 else [self.settings.fixed_objects]
+        log_prior = np.asarray(counts) * np.log(self.settings.count_ratio)
+        if self.settings.fixed_objects < 0:
+            log_prior -= np.logaddexp.reduce(np.arange(self.settings.max_objects + 1) * np.log(self.settings.count_ratio))
+        else:
+            log_prior = np.zeros(1)
+        log_z = np.array([float(s.log_evidence) for s in stages])
+        log_evidence = np.logaddexp.reduce(log_prior + log_z)
+        log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
+        log_weight -= np.logaddexp.reduce(log_weight)
+        n = np.repeat(counts, [len(s.log_weight) for s in stages])
+        keep = log_weight > -30
+        objects = Contact(*(np.concatenate(parts)[keep] for parts in zip(*(s.objects for s in stages), strict=True)))
+        held = np.arange(objects.type.shape[1]) < n[keep, None]
+        T = np.asarray(self._poses(objects, table))
+        quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
+        samples = SceneSamples(
+            log_weight=(log_weight[keep] - np.logaddexp.reduce(log_weight[keep])).astype(np.float32),
+            num_objects=n[keep].astype(np.int32),
+            type=np.where(held, objects.type, -1).astype(np.int32),
+            face=np.where(held, objects.face, -1).astype(np.int32),
+            position=np.where(held[..., None], T[..., :3, 3], 0.0).astype(np.float32),
+            orientation=np.where(held[..., None], quaternion, [0, 0, 0, 1]).astype(np.float32),
+            p_outlier=np.concatenate([s.p_outlier for s in stages])[keep],
+            sigma=np.concatenate([s.sigma for s in stages])[keep],
+        )
+        return samples, float(log_evidence)
+
+    def _poses(self, objects: Contact, table: Table) -> Float[np.ndarray, "S M 4 4"]:
+        """T_camera_object in float64 numpy: sample counts differ from frame to frame, and must not recompile."""
+        T_contact = np.asarray(self._arrays.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
+        slide = np.zeros((*objects.type.shape, 4, 4))
+        c, s = np.cos(objects.yaw), np.sin(objects.yaw)
+        slide[..., 0, 0], slide[..., 0, 1], slide[..., 1, 0], slide[..., 1, 1] = c, -s, s, c
+        slide[..., 2, 2] = slide[..., 3, 3] = 1
+        slide[..., 0, 3], slide[..., 1, 3] = objects.x, objects.y
+        return np.asarray(table.T_camera_table, np.float64) @ slide @ T_contact
+
+    def _reconstruct(self, frame, T_camera_table, samples, summary):
+        """Depth and labels of the best scene at the input's size, drawn by the model's own renderer."""
+        camera = frame.intrinsics
+        rays = camera.rays()
+        normal = T_camera_table[:3, 2]
+        facing = rays @ normal
+        with np.errstate(divide="ignore"):
+            depth = np.where(facing < -1e-3, (normal @ T_camera_table[:3, 3]) / facing, np.inf)
+        depth = np.where((depth > 0) & (depth < self.settings.far), depth, np.inf).astype(np.float32)
+        labels = np.zeros(depth.shape, np.uint16)
+        for label, slot in enumerate(summary.slots, 1):
+            kind = samples.type[summary.reference, slot]
+            T = np.eye(4, dtype=np.float32)
+            T[:3, :3] = Rotation.from_quat(samples.orientation[summary.reference, slot]).as_matrix()
+            T[:3, 3] = samples.position[summary.reference, slot]
+            drawn = np.asarray(self._cast(self._arrays, jnp.array([kind]), jnp.asarray(T[None]), rays.reshape(1, -1, 3)))
+            drawn = drawn.reshape(depth.shape)
+            nearer = drawn < depth
+            depth, labels = np.where(nearer, drawn, depth), np.where(nearer, np.uint16(label), labels)
+        return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels
+
+
+def _frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:
+    """A frame's random numbers depend on the seed and its own stamp: seconds, then nanoseconds."""
+    key = jax.random.key(seed)
+    return jax.random.fold_in(jax.random.fold_in(key, stamp_ns // 10**9 % 2**32), stamp_ns % 10**9)

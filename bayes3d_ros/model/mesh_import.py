@@ -14,6 +14,7 @@ from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
+CLOSENESS = np.deg2rad(8.0)  # of two such facets, the likelihood of the one this much farther off counts e times less
 
 
 class ImportedMesh(NamedTuple):
@@ -79,14 +80,17 @@ def contact_normals(
 ) -> Float[np.ndarray, "6 3"]:
     """For each face of the box (+x -x +y -y +z -z) the direction that points down when the object rests on it.
 
-    It is the likeliest stable facet of the convex hull close to the face; where there is none the largest facet;
-    where the hull has none either, as on a sphere, the face's own normal.
+    It is a stable facet of the convex hull near the face, likely to be rested on and close to the face; where none is
+    stable the largest; where the hull has no facet there, the face's own normal.
     """
-    facets = resting_facets(mesh, centre_of_mass)
-    faces = np.concatenate([box_axes.T, -box_axes.T]).reshape(2, 3, 3).swapaxes(0, 1).reshape(6, 3)
+    facets = [facet for facet in resting_facets(mesh, centre_of_mass) if facet.area > 0]
+    normals = np.array([facet.normal for facet in facets]).reshape(-1, 3)
+    stable = np.array([facet.stable for facet in facets], bool)
+    weight = np.array([facet.solid_angle if facet.stable else facet.area for facet in facets])
     chosen = []
-    for face in faces:
-        near = [f for f in facets if f.normal @ face > np.cos(CONTACT_ANGLE) and f.area > 0]
-        best = max(near, key=lambda f: (f.stable, f.solid_angle if f.stable else f.area), default=None)
-        chosen.append(face if best is None else best.normal)
+    for face in (sign * axis for axis in box_axes.T for sign in (1, -1)):
+        angle = np.arccos(np.clip(normals @ face, -1, 1))
+        score = np.where(angle < CONTACT_ANGLE, weight * np.exp(-((angle / CLOSENESS) ** 2)), 0)
+        score = np.where(stable, score, 0) if (score[stable] > 0).any() else score
+        chosen.append(normals[score.argmax()] if (score > 0).any() else face)
     return np.array(chosen)

@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -61,8 +62,10 @@ class ObjectModel:
 def _check(model: ObjectModel) -> None:
     if not isinstance(model.name, str) or not NAME_PATTERN.fullmatch(model.name):
         raise ValueError(f"name must be made of letters, digits, '_' and '-', got {model.name!r}")
+    if not isinstance(model.provenance, dict):
+        raise ValueError(f"provenance must be a dict, got {model.provenance!r}")
     if not (np.isfinite(model.voxel_size) and model.voxel_size > 0):
-        raise ValueError(f"voxel_size must be positive, got {model.voxel_size}")
+        raise ValueError(f"voxel_size must be positive, got {model.voxel_size!r}")
     if model.occupancy.ndim != 3 or model.occupancy.dtype != bool or not model.occupancy.any():
         raise ValueError(f"occupancy must be a 3D bool array with a voxel set, got shape {model.occupancy.shape}")
     count = len(model.surface_index)
@@ -131,7 +134,7 @@ def save_model(model: ObjectModel, folder: Path) -> Path:
         "voxel_size": float(model.voxel_size),
         "provenance": model.provenance,
     }
-    arrays = {
+    arrays: dict[str, Any] = {
         "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8),
         "shape": np.array(shape, np.int32),
         "occupancy": np.packbits(model.occupancy),
@@ -166,9 +169,11 @@ def load_model(path: Path) -> ObjectModel:
     if not path.is_file():
         raise LibraryError(f"{path}: no such model file")
     try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("not a .npz file, or cut short")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise LibraryError(f"{path}: corrupt or not a model file ({' '.join(str(error).split())[:120]})") from error
     try:
         return _decode(arrays)
@@ -179,10 +184,8 @@ def load_model(path: Path) -> ObjectModel:
 
 
 def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
-    meta = json.loads(arrays["meta"].astype(np.uint8).tobytes().decode())
-    if meta["format"] != FORMAT_VERSION:
-        raise ValueError(f"format version {meta['format']}, expected {FORMAT_VERSION}")
-    voxel_size = float(meta["voxel_size"])
+    meta = _decode_meta(arrays["meta"])
+    voxel_size = meta["voxel_size"]
     shape = tuple(int(n) for n in arrays["shape"])
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(f"shape must be three positive numbers, got {shape}")
@@ -196,6 +199,9 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
     index = np.argwhere(masks["surface"])
     normal, offset = arrays["surface_normal"].T.astype(float), arrays["surface_offset"].astype(float)
     frames = arrays["frames"]
+    for name in ("frames", "contact_normal"):
+        if arrays[name].dtype != np.float64:
+            raise ValueError(f"{name} must hold 64-bit floats, got {arrays[name].dtype}")
     if normal.shape != (len(index), 3) or offset.shape != (len(index),):
         raise ValueError(f"surface_normal and surface_offset must describe {len(index)} surface voxels")
     if frames.shape != (24,):
@@ -214,6 +220,20 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
         contact_height=frames[18:],
         provenance=meta["provenance"],
     )
+
+
+def _decode_meta(array: np.ndarray) -> dict:
+    try:
+        meta = json.loads(array.astype(np.uint8).tobytes().decode())
+    except ValueError as error:
+        raise ValueError(f"meta must be JSON ({error})") from error
+    if not isinstance(meta, dict):
+        raise ValueError("meta must be a JSON object")
+    if meta["format"] != FORMAT_VERSION:
+        raise ValueError(f"format version {meta['format']}, expected {FORMAT_VERSION}")
+    if not isinstance(meta["voxel_size"], float):
+        raise ValueError(f"voxel_size must be a number of metres, got {meta['voxel_size']!r}")
+    return meta
 
 
 def load_library(folder: Path) -> Library:

@@ -51,6 +51,7 @@ class ScenePosterior:
     T_camera_table: Float[np.ndarray, "4 4"]
     ess: tuple[float, ...]  # effective sample size before resampling, as a fraction, of every stage
     seconds: float
+    object_index: Int[np.ndarray, "S M"] | None = None  # which of `objects` each sample's object is (summaries.Summary)
     notes: tuple[str, ...] = field(default=())  # what a user should know of this frame, one line each
 
 

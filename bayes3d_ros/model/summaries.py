@@ -1,6 +1,5 @@
 """From weighted scenes to what people and robots read: one scene, and how sure every part of it is."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +37,7 @@ class Summary:
 
 
 def summarise(
-    samples: SceneSamples, types: Sequence[str], min_probability: float, library: Library | None = None
+    samples: SceneSamples, types: tuple[str, ...], min_probability: float, library: Library | None = None
 ) -> Summary:
     """Summaries of a posterior. `types` are the names that `samples.type` indexes.
 
@@ -192,7 +191,7 @@ def _group_weight(rows: Int[np.ndarray, "S M"], weights: Float[np.ndarray, "S"])
 
 
 def _estimate(
-    samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[np.ndarray, "S M"], types: Sequence[str]
+    samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[np.ndarray, "S M"], types: tuple[str, ...]
 ) -> ObjectEstimate:
     sample, slot = np.nonzero(member)
     kind = samples.type[sample, slot]
@@ -203,9 +202,9 @@ def _estimate(
         samples.position[sample, slot], samples.orientation[sample, slot], weights[sample]
     )
     faces = np.bincount(samples.face[sample, slot][pose.members].clip(min=0), weights[sample][pose.members])
-    ranked = sorted(np.flatnonzero(by_type), key=lambda t: (-by_type[t], t))
+    ranked = sorted(np.flatnonzero(by_type).tolist(), key=lambda t: (-by_type[t], t))
     return ObjectEstimate(
-        type=types[int(by_type.argmax())],
+        type=types[ranked[0]],
         type_probabilities={types[t]: float(by_type[t] / by_type.sum()) for t in ranked},
         probability=min(float(by_type.sum()), 1.0),
         position=pose.position,

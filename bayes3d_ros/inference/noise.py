@@ -1,0 +1,85 @@
+"""Noise variables are marginalised numerically: log likelihoods on a coarse grid, splines between, a fine sum.
+
+The log likelihood of a scene is smooth in (log sigma, logit p_outlier) and its peak is narrow: tens of pixels make a coarse
+grid exact enough to interpolate, thousands make it useless to sum.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from scipy.interpolate import CubicSpline
+
+from bayes3d_ros.model.likelihood import Noise
+
+_SIGMA_STEPS, _P_STEPS = 14, 12  # coarse grid: sigma_max 2^(-k/4), logit p
+_SIGMA_FINE, _P_FINE = 12, 16  # fine points between coarse ones
+_P_LOW, _P_HIGH = 1e-3, 0.9
+
+
+class NoiseGrid(NamedTuple):
+    """The coarse grid, the fine one, and what carries values from one to the other."""
+
+    coarse: Noise  # [S], [P]
+    fine: Noise  # [Sf], [Pf]
+    to_fine_sigma: Float[Array, "Sf S"]
+    to_fine_p: Float[Array, "Pf P"]
+    log_mass: Float[Array, "Sf Pf"]  # prior mass of the fine points
+
+
+def noise_grid(sigma_max: float) -> NoiseGrid:
+    """sigma ~ U(0, sigma_max) and p_outlier ~ U(0, 1), both proper; the mass below the grid's ends is left out."""
+    u = np.log(sigma_max) - np.log(2) / 4 * np.arange(_SIGMA_STEPS)[::-1]
+    v = np.linspace(_logit(_P_LOW), _logit(_P_HIGH), _P_STEPS)
+    u_fine = np.linspace(u[0], u[-1], (len(u) - 1) * _SIGMA_FINE + 1)
+    v_fine = np.linspace(v[0], v[-1], (len(v) - 1) * _P_FINE + 1)
+    p_fine = 1 / (1 + np.exp(-v_fine))
+    mass_sigma = np.exp(u_fine) / sigma_max * _trapezoid(u_fine)
+    mass_p = p_fine * (1 - p_fine) * _trapezoid(v_fine)
+    return NoiseGrid(
+        coarse=Noise(jnp.float32(np.exp(u)), jnp.float32(1 / (1 + np.exp(-v)))),
+        fine=Noise(jnp.float32(np.exp(u_fine)), jnp.float32(p_fine)),
+        to_fine_sigma=jnp.float32(CubicSpline(u, np.eye(len(u)))(u_fine)),
+        to_fine_p=jnp.float32(CubicSpline(v, np.eye(len(v)))(v_fine)),
+        log_mass=jnp.float32(np.log(mass_sigma)[:, None] + np.log(mass_p)[None]),
+    )
+
+
+def _logit(p: float) -> float:
+    return float(np.log(p / (1 - p)))
+
+
+def _trapezoid(x: np.ndarray) -> np.ndarray:
+    step = np.full(len(x), x[1] - x[0])
+    step[[0, -1]] /= 2
+    return step
+
+
+def _fine(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N Sf Pf"]:
+    # Splines of large numbers lose their small differences in float32: interpolate about the peak.
+    peak = table.max((-2, -1), keepdims=True)
+    exact = jax.lax.Precision.HIGHEST
+    rows = jnp.einsum("fs,nsp->nfp", grid.to_fine_sigma, table - peak, precision=exact)
+    return jnp.einsum("gp,nfp->nfg", grid.to_fine_p, rows, precision=exact) + grid.log_mass
+
+
+def log_marginal(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N"]:
+    """log of the integral of exp(table) over the noise prior."""
+    return jax.nn.logsumexp(_fine(table, grid), (-2, -1)) + table.max((-2, -1))
+
+
+def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
+    """One draw of (sigma, p_outlier) per particle given its scene."""
+    fine = _fine(table, grid)
+    index: Int[Array, "N"] = jax.random.categorical(key, fine.reshape(len(fine), -1))
+    columns = fine.shape[-1]
+    return Noise(grid.fine.sigma[index // columns], grid.fine.p_outlier[index % columns])
+
+
+def peak(table: Float[Array, "S P"], grid: NoiseGrid) -> Noise:
+    """The coarse grid's best (sigma, p_outlier), each an array of one, for searches at a single noise level."""
+    index = jnp.argmax(table)
+    columns = table.shape[-1]
+    return Noise(grid.coarse.sigma[index // columns][None], grid.coarse.p_outlier[index % columns][None])

@@ -1,0 +1,128 @@
+"""A library as padded arrays: what compiled code sees. Shapes depend on padded sizes only, so that a library can
+gain an object without a recompilation."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.ndimage import distance_transform_cdt
+
+from bayes3d_ros.model.objects import Library, ObjectModel
+
+NUM_FACES = 6
+OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
+SKETCH_POINTS = 96  # surface points a type, for the coarse score
+SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
+_TYPE_PAD, _VOXEL_PAD = 4, 1 << 16
+
+
+class LibraryArrays(NamedTuple):
+    """K types (padded), V voxels of all grids laid end to end.
+
+    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8) and offset (int8); an empty voxel holds
+    zeros and the Chebyshev distance in voxels to the nearest surface voxel; a voxel inside the solid is all zeros.
+    """
+
+    num_types: Int[Array, ""]
+    words: Int[Array, "V"]
+    first: Int[Array, "K"]  # index of the type's first voxel
+    dims: Int[Array, "K 3"]
+    voxel_size: Float[Array, "K"]
+    origin: Float[Array, "K 3"]
+    T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
+    face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
+    radius: Float[Array, "K"]  # of a ball about the box centre
+    sketch: Float[Array, "K P 3"]  # surface points, object frame
+    sketch_normal: Float[Array, "K P 3"]
+    sketch_area: Float[Array, "K"]  # metres^2 that one of them stands for
+    solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
+
+
+def contact_transform(model: ObjectModel, face: int) -> Float[np.ndarray, "4 4"]:
+    """T_contact_object: contact_normal[face] turned to -z, lowest point at z = 0, box centre above the origin.
+
+    The free rotation about z is fixed by turning the box axis that follows the face's own axis to +x.
+    """
+    down = model.contact_normal[face].astype(np.float64)
+    z = -down / np.linalg.norm(down)
+    x = model.T_object_box[:3, (face // 2 + 1) % 3]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    centre = rotation @ model.T_object_box[:3, 3]
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = [-centre[0], -centre[1], model.contact_height[face]]
+    return transform
+
+
+def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
+    """Extent of the face along the contact frame's x and y, in metres."""
+    axis = face // 2
+    return model.box_size[[(axis + 1) % 3, (axis + 2) % 3]]
+
+
+def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "V"]:
+    """The model's grid as 32-bit words (see LibraryArrays)."""
+    surface = np.zeros(model.occupancy.shape, bool)
+    surface[tuple(model.surface_index.T)] = True
+    distance = np.minimum(distance_transform_cdt(~surface, "chessboard"), 255)
+    words = np.where(model.occupancy & ~surface, 0, distance).astype(np.uint32)
+    normal = np.rint(model.surface_normal * 127).astype(np.int64)
+    offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
+    plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
+    words[tuple(model.surface_index.T)] = plane
+    return words.view(np.int32).ravel()
+
+
+def library_arrays(library: Library) -> LibraryArrays:
+    """Pack a library for the device, padded to a few sizes."""
+    models = library.models
+    count = len(models)
+    padded = -(-count // _TYPE_PAD) * _TYPE_PAD
+    sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
+    grids = [pack_voxels(m) for m in models]
+    first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
+    words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
+    words[: first[-1]] = np.concatenate(grids)
+
+    def stack(rows: list[np.ndarray], dtype: type = np.float32) -> Array:
+        rows = rows + [rows[0]] * (padded - count)
+        return jnp.asarray(np.stack(rows).astype(dtype))
+
+    return LibraryArrays(
+        num_types=jnp.int32(count),
+        words=jnp.asarray(words),
+        first=stack(list(first[:count]), np.int32),
+        dims=stack([np.array(m.occupancy.shape) for m in models], np.int32),
+        voxel_size=stack([np.float32(m.voxel_size) for m in models]),
+        origin=stack([m.origin for m in models]),
+        T_contact_object=stack([np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]),
+        face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
+        radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
+        sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
+        sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),
+        sketch_area=stack([np.float32(len(m.surface_index) * m.voxel_size**2 / SKETCH_POINTS) for m in models]),
+        solid=stack([p[_spread(p, SOLID_POINTS)] for p in map(_inside, models)]),
+    )
+
+
+def _inside(model: ObjectModel) -> Float[np.ndarray, "Q 3"]:
+    """Centres of the voxels of the solid."""
+    return model.origin + (np.argwhere(model.occupancy) + 0.5) * model.voxel_size
+
+
+def _spread(points: Float[np.ndarray, "S 3"], count: int) -> Int[np.ndarray, "count"]:
+    """Indices of `count` points spread evenly (farthest-point order, so that a prefix is spread evenly too)."""
+    if len(points) <= count:
+        return np.arange(count) % len(points)
+    pool = np.linspace(0, len(points) - 1, min(len(points), 20 * count)).astype(int)
+    points = points[pool]
+    chosen = np.empty(count, int)
+    chosen[0] = np.argmin(((points - points.mean(0)) ** 2).sum(1))
+    distance = np.full(len(points), np.inf)
+    for i in range(1, count):
+        distance = np.minimum(distance, ((points - points[chosen[i - 1]]) ** 2).sum(1))
+        chosen[i] = distance.argmax()
+    return pool[chosen]

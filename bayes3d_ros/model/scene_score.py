@@ -1,0 +1,210 @@
+"""Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change.
+
+The image region of each hypothesis is cut into tiles; tiles of all hypotheses form one list, worked through in chunks of
+static shape, as many as it takes. Cost grows with the pixels that hypotheses cover and no N x H x W image is made.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.model.library_arrays import LibraryArrays
+from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
+from bayes3d_ros.model.rendering import renderers
+from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
+
+TILE = 16
+CHUNK = 32
+
+
+class Image(NamedTuple):
+    """The observed depth at scoring resolution."""
+
+    depth: Float[Array, "H W"]  # metres, 0 where there is no return
+    kind: Int[Array, "H W"]
+    ray_x: Float[Array, "W"]
+    ray_y: Float[Array, "H"]
+    focal: Float[Array, "2"]
+    centre: Float[Array, "2"]
+    table: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
+    outlier_scale: Float[Array, ""]
+    front_margin: Float[Array, ""]
+
+
+def border(window: int) -> tuple[int, int]:
+    """Pixels of padding before and after a scene's depth image, so that every tile with its window lies inside."""
+    return window // 2, window // 2 + TILE
+
+
+def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
+    pad = [(0, 0)] * (depth.ndim - 2) + [border(window)] * 2
+    return jnp.pad(depth, pad, constant_values=jnp.inf)
+
+
+class _Tiles(NamedTuple):
+    first: Int[Array, "N+1"]  # number of tiles of the hypotheses before
+    u: Int[Array, "N"]
+    v: Int[Array, "N"]
+    columns: Int[Array, "N"]
+
+
+def _tiles(T: Float[Array, "N 4 4"], type_index: Int[Array, "N"], image: Image, library: LibraryArrays, half: int):
+    """The tiles that cover the projection of each object's grid, grown by the window."""
+    height, width = image.depth.shape
+    corners = jnp.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], jnp.float32)
+    extent = library.dims[type_index] * library.voxel_size[type_index][:, None]
+    points = library.origin[type_index][:, None] + corners * extent[:, None]
+    points = (T[:, None, :3, :3] * points[:, :, None, :]).sum(-1) + T[:, None, :3, 3]
+    z = points[..., 2]
+    uv = points[..., :2] / jnp.maximum(z, 0.02)[..., None] * image.focal + image.centre
+    limit = jnp.array([width, height])
+    low = jnp.clip(jnp.floor(uv.min(1)) - half, 0, limit).astype(jnp.int32)
+    high = jnp.clip(jnp.ceil(uv.max(1)) + 1 + half, 0, limit).astype(jnp.int32)
+    behind = (z < 0.02).any(1)[:, None]
+    low, high = jnp.where(behind, 0, low), jnp.where(behind, limit, high)
+    low = jnp.where((z.max(1) < 0.02)[:, None], high, low)
+    count = -(-jnp.maximum(high - low, 0) // TILE)
+    first = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count[:, 0] * count[:, 1])])
+    return _Tiles(first, low[:, 0], low[:, 1], jnp.maximum(count[:, 0], 1))
+
+
+def _over_tiles(work, carry, contact, image, library, table, half):
+    """carry = work(carry, hypothesis, u, v, object depth with border, real) over every chunk of tiles."""
+    T = T_camera_object(contact, library, table)
+    tiles = _tiles(T, contact.type, image, library, half)
+    total, count = tiles.first[-1], contact.type.shape[0]
+    offset = jnp.arange(-half, TILE + half)
+    render = renderers["march"]
+
+    def chunk(state):
+        start, carry = state
+        index = start + jnp.arange(CHUNK)
+        real = index < total
+        n = jnp.clip(jnp.searchsorted(tiles.first, index, side="right") - 1, 0, count - 1)
+        within = jnp.where(real, index - tiles.first[n], 0)
+        u = tiles.u[n] + within % tiles.columns[n] * TILE
+        v = tiles.v[n] + within // tiles.columns[n] * TILE
+        x = (u[:, None] + offset - image.centre[0]) / image.focal[0]
+        y = (v[:, None] + offset - image.centre[1]) / image.focal[1]
+        side = TILE + 2 * half
+        rays = jnp.stack(
+            [
+                jnp.broadcast_to(x[:, None, :], (CHUNK, side, side)),
+                jnp.broadcast_to(y[:, :, None], (CHUNK, side, side)),
+                jnp.ones((CHUNK, side, side)),
+            ],
+            -1,
+        )
+        depth = render(library, contact.type[n], T[n], rays.reshape(CHUNK, -1, 3)).reshape(CHUNK, side, side)
+        return start + CHUNK, work(carry, n, u, v, depth, real)
+
+    return jax.lax.while_loop(lambda state: state[0] < total, chunk, (jnp.int32(0), carry))[1]
+
+
+def _crop(scenes, index, u, v, side):
+    """Square crops of padded scenes; (u, v) are pixels of the unpadded image, the crop starts half a window before."""
+    rows = v[:, None] + jnp.arange(side)
+    columns = u[:, None] + jnp.arange(side)
+    return scenes[index[:, None, None], rows[:, :, None], columns[:, None, :]]
+
+
+def _observed(image: Image, u, v) -> Pixels:
+    """The observed pixels of tiles; those that stick out of the image have no return."""
+    height, width = image.depth.shape
+    rows, columns = v[:, None] + jnp.arange(TILE), u[:, None] + jnp.arange(TILE)
+    inside = (rows < height)[:, :, None] & (columns < width)[:, None, :]
+    rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
+    shape = inside.shape
+    return Pixels(
+        depth=image.depth[rows[:, :, None], columns[:, None, :]],
+        kind=jnp.where(inside, image.kind[rows[:, :, None], columns[:, None, :]], 0),
+        ray_x=jnp.broadcast_to(image.ray_x[columns][:, None, :], shape),
+        ray_y=jnp.broadcast_to(image.ray_y[rows][:, :, None], shape),
+        step_x=1 / image.focal[0],
+        step_y=1 / image.focal[1],
+        outlier_scale=image.outlier_scale,
+        front_margin=image.front_margin,
+    )
+
+
+def log_likelihood_gain(
+    contact: Contact,
+    ancestor: Int[Array, "N"],
+    scenes: Float[Array, "A Hp Wp"],
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+    noise: Noise,
+    window: int,
+) -> Float[Array, "N S P"]:
+    """log p(image | scene and object) - log p(image | scene) for each hypothesis and every (sigma, p_outlier).
+
+    scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
+    """
+    half = window // 2
+    side = TILE + 2 * half
+
+    def add(gains, n, u, v, depth, real):
+        pixels = _observed(image, u, v)
+        before = _crop(scenes, ancestor[n], u, v, side)
+        after = jnp.minimum(before, depth)
+        gain = log_likelihood(after, pixels, noise.sigma, noise.p_outlier, window)
+        gain -= log_likelihood(before, pixels, noise.sigma, noise.p_outlier, window)
+        return gains.at[n].add(jnp.where(real[:, None, None], gain, 0.0))
+
+    gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    return _over_tiles(add, gains, contact, image, library, table, half)
+
+
+def add_objects(
+    contact: Contact,
+    scenes: Float[Array, "N Hp Wp"],
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+    window: int,
+) -> tuple[Float[Array, "N Hp Wp"], Int[Array, "N"]]:
+    """Scene n with object n rendered into it, and the number of pixels that the object covers alone in the image."""
+    half = window // 2
+    height, width = image.depth.shape
+
+    def draw(state, n, u, v, depth, real):
+        scenes, covered = state
+        depth = jnp.where(real[:, None, None], depth[:, half : half + TILE, half : half + TILE], jnp.inf)
+        rows, columns = v[:, None] + jnp.arange(TILE), u[:, None] + jnp.arange(TILE)
+        inside = (rows < height)[:, :, None] & (columns < width)[:, None, :]
+        depth = jnp.where(inside, depth, jnp.inf)
+        scenes = scenes.at[n[:, None, None], half + rows[:, :, None], half + columns[:, None, :]].min(depth)
+        return scenes, covered.at[n].add(jnp.isfinite(depth).sum((1, 2)))
+
+    return _over_tiles(draw, (scenes, jnp.zeros(contact.type.shape, jnp.int32)), contact, image, library, table, half)
+
+
+def log_likelihood_scene(
+    scenes: Float[Array, "A Hp Wp"], image: Image, noise: Noise, window: int
+) -> Float[Array, "A S P"]:
+    """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
+    height, width = image.depth.shape
+    before, after = border(window)
+    pad = [(0, -height % 4), (0, -width % 4)]
+    pixels = Pixels(
+        depth=jnp.pad(image.depth, pad)[None],
+        kind=jnp.pad(image.kind, pad)[None],
+        ray_x=jnp.broadcast_to(jnp.pad(image.ray_x, pad[1]), (1, height + pad[0][1], width + pad[1][1])),
+        ray_y=jnp.broadcast_to(jnp.pad(image.ray_y, pad[0])[:, None], (1, height + pad[0][1], width + pad[1][1])),
+        step_x=1 / image.focal[0],
+        step_y=1 / image.focal[1],
+        outlier_scale=image.outlier_scale,
+        front_margin=image.front_margin,
+    )
+    rows, columns = height + pad[0][1] + 2 * before, width + pad[1][1] + 2 * before
+    return jax.lax.map(
+        lambda scene: log_likelihood(
+            scene[None, :rows, :columns], pixels, noise.sigma, noise.p_outlier, window
+        )[0],
+        scenes,
+    )
+
+
