@@ -47,15 +47,17 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     shape = shape.astype(int)
     origin = (low + high) / 2 - shape * voxel_size / 2
     samples = sample_surface(mesh, voxel_size / SAMPLES_PER_EDGE)
+    if mesh.volume < 0:  # wound inside out
+        samples = samples._replace(normals=-samples.normals)
     patches = fit_planes(samples, origin, voxel_size, tuple(shape))
     touched = np.zeros(shape, bool)
-    touched[tuple(patches.index.T)] = True
+    touched[tuple(patches.voxel.T)] = True
     occupancy = fill_enclosed(touched)
-    keep = ~_redundant(patches, voxel_size, touched.shape)
-    dropped = ~keep & (patches.offset > 0)  # the centre lies behind the surface: solid, though not a surface voxel
-    occupancy[tuple(patches.index[~keep & ~dropped].T)] = False
+    drop = _redundant(patches, voxel_size, touched.shape)
+    occupancy[tuple(patches.voxel[drop].T)] = patches.offset[drop] > 0  # where the centre lies behind the surface
+    keep = ~drop
     return VoxelSolid(
-        float(voxel_size), origin, occupancy, patches.index[keep], patches.normal[keep], patches.offset[keep]
+        float(voxel_size), origin, occupancy, patches.voxel[keep], patches.normal[keep], patches.offset[keep]
     )
 
 
@@ -68,7 +70,7 @@ def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z
 class Patches(NamedTuple):
     """The piece of surface in every voxel that has one, in C order of the voxels."""
 
-    index: Int[np.ndarray, "S 3"]
+    voxel: Int[np.ndarray, "S 3"]
     normal: Float[np.ndarray, "S 3"]
     offset: Float[np.ndarray, "S"]  # metres from the voxel's centre, along the normal
     centroid: Float[np.ndarray, "S 3"]  # metres from the voxel's centre
@@ -141,13 +143,13 @@ def _reference_normals(
 def _redundant(patches: Patches, voxel_size: float, shape: tuple[int, ...]) -> Bool[np.ndarray, "S"]:
     """Voxels that the surface only clips, where a neighbour's plane, within its reach, covers the clip."""
     row_of = np.full(np.array(shape) + 2, -1)
-    row_of[tuple(patches.index.T + 1)] = np.arange(len(patches.index))
+    row_of[tuple(patches.voxel.T + 1)] = np.arange(len(patches.voxel))
     small = np.flatnonzero(patches.area < 0.1 * voxel_size**2)
-    redundant = np.zeros(len(patches.index), bool)
+    redundant = np.zeros(len(patches.voxel), bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
         if step == (0, 0, 0):
             continue
-        neighbour = row_of[tuple((patches.index[small] + 1 + step).T)]
+        neighbour = row_of[tuple((patches.voxel[small] + 1 + step).T)]
         seen = patches.centroid[small] - np.array(step) * voxel_size  # from the neighbour's centre
         within = (np.abs(seen) < (0.5 + REACH) * voxel_size).all(1)
         miss = np.abs(np.einsum("ij,ij->i", patches.normal[neighbour], seen) - patches.offset[neighbour])
