@@ -53,6 +53,7 @@ class DepthInputs:
         self._pairing: StampPairing[Image, CameraInfo] = StampPairing(patience)
         self._waiting: DepthMessages | None = None  # for the camera's pose
         self._overtaken = 0
+        self.received = 0
         self._depth_at: float | None = None
         self._info_at: float | None = None
         self._auto = reliability == "auto"
@@ -128,6 +129,7 @@ class DepthInputs:
 
     def _on_image(self, image: Image) -> None:
         self._depth_at = time.monotonic()
+        self.received += 1
         self._take(self._pairing.add_image(stamp_to_ns(image.header.stamp), image, self._depth_at))
 
     def _on_info(self, info: CameraInfo) -> None:

@@ -58,7 +58,7 @@ class Health:
         self._problem, self._problem_at, self._logged_at = "", 0.0, -1e9
         self._posterior: ScenePosterior | None = None
         self._latency = 0.0
-        self.received, self.parsed, self.refused = 0, 0, 0
+        self.parsed, self.refused = 0, 0
         self.backend = ""
 
     def problem(self, text: str) -> bool:
@@ -85,7 +85,9 @@ class Health:
             answered = bool(self._outputs) and self._outputs[-1] > self._problem_at
             return "" if answered else self._problem
 
-    def report(self, name: str, level: bytes, message: str, state: str, dropped: int, notes: str) -> DiagnosticArray:
+    def report(
+        self, name: str, level: bytes, message: str, *, state: str, received: int, dropped: int, notes: str
+    ) -> DiagnosticArray:
         """The message for /diagnostics, stamped with the system's time."""
         with self._lock:
             status = DiagnosticStatus(name=name, level=level, message=message, hardware_id=self.backend or "none")
@@ -95,7 +97,7 @@ class Health:
                 rate_hz=f"{self._rate():.2f}",
                 latency_s=f"{self._latency:.3f}",
                 parse_s="" if posterior is None else f"{posterior.seconds:.3f}",
-                received=str(self.received),
+                received=str(received),
                 parsed=str(self.parsed),
                 refused=str(self.refused),
                 dropped=str(dropped),

@@ -71,7 +71,7 @@ class SceneParserNode(Node):
         self._inputs: DepthInputs | None = None
         self._preparing_since: float | None = None
         self._requests = 0
-        self._dropped_before = 0
+        self._received_before, self._dropped_before = 0, 0
         self._refusal = ""
         self._outputs = ScenePublishers(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -241,6 +241,7 @@ class SceneParserNode(Node):
 
     def _close_inputs(self) -> None:
         if self._inputs is not None:
+            self._received_before += self._inputs.received
             self._dropped_before += self._inputs.dropped
             self._inputs.close()
             self._inputs = None
@@ -279,11 +280,17 @@ class SceneParserNode(Node):
 
     def _report(self) -> None:
         inputs = self._inputs
-        dropped = self._dropped_before + self._worker.dropped + (inputs.dropped if inputs else 0)
         level, message = self._why()
-        notes = inputs.notes() if inputs else ""
-        name = f"{self.get_fully_qualified_name()}: scene parsing"
-        self._diagnostics.publish(self._health.report(name, level, message, self._state_label(), dropped, notes))
+        report = self._health.report(
+            f"{self.get_fully_qualified_name()}: scene parsing",
+            level,
+            message,
+            state=self._state_label(),
+            received=self._received_before + (inputs.received if inputs else 0),
+            dropped=self._dropped_before + self._worker.dropped + (inputs.dropped if inputs else 0),
+            notes=inputs.notes() if inputs else "",
+        )
+        self._diagnostics.publish(report)
 
     def _why(self) -> tuple[bytes, str]:
         """The level and the one line that says whether there is output, and if not, why."""
@@ -293,11 +300,10 @@ class SceneParserNode(Node):
             return WARN, f"compiling for the library, {time.monotonic() - self._preparing_since:.0f} s so far"
         if self._inputs is None:
             return WARN, f"the node is {self._state_label()}; configure and activate it"
-        silent = why_no_input(self._inputs.view())
-        problem = self._health.recent_problem()
-        if silent or problem:
-            return WARN, silent or problem
-        return OK, "parsing" if self._health.parsed else "the first frame is being parsed"
+        why = self._health.recent_problem()
+        if self._worker.idle:
+            why = why_no_input(self._inputs.view()) or why
+        return (WARN, why) if why else (OK, "parsing")
 
 
 def _one_line(error: Exception, named: bool = True) -> str:

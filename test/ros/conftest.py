@@ -1,0 +1,206 @@
+"""Nodes in processes of their own, over real DDS, on a domain that nobody else on this machine uses."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+import trimesh
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+import bayes3d_ros
+from bayes3d_ros.geometry.depth_image import encode_depth
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import load_library, save_model
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.ros.conversions import image_message, ns_to_stamp
+
+HERE = Path(__file__).parent
+PACKAGE = Path(bayes3d_ros.__file__).parents[1]  # the processes import what the tests import
+
+
+def free_domain() -> int:
+    """A ROS domain without a participant on this machine: its discovery port can be bound."""
+    for k in range(100):
+        domain = 1 + (os.getpid() + k) % 100
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain))
+                return domain
+            except OSError:
+                continue
+    raise RuntimeError("no free ROS domain")
+
+
+class Ros:
+    """A node of the test's own, and processes that it talks to."""
+
+    def __init__(self) -> None:
+        self.domain = free_domain()
+        self.context = rclpy.Context()
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        rclpy.init(context=self.context, domain_id=self.domain)
+        self.node = Node("test", context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._processes: list[subprocess.Popen] = []
+
+    def start(self, *command: str) -> subprocess.Popen:
+        """Start `python COMMAND...` on this domain."""
+        path = os.pathsep.join([str(PACKAGE), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain), "PYTHONPATH": path}
+        process = subprocess.Popen(
+            [sys.executable, *command], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self._processes.append(process)
+        return process
+
+    def start_parser(self, library: Path | str, *arguments: str, **parameters: Any) -> subprocess.Popen:
+        """Start scene_parser with a fake parser. `arguments` come before the ROS arguments."""
+        pairs = {"library": library, "patience": 0.2, **parameters}
+        assignments = [word for name, value in pairs.items() for word in ("-p", f"{name}:={value}")]
+        return self.start(str(HERE / "fake_scene_parser.py"), *arguments, "--ros-args", *assignments)
+
+    def stop(self, process: subprocess.Popen, *signals: int) -> tuple[int, str]:
+        """Send signals (default: SIGINT) and wait; exit status and all output."""
+        for number in signals or (signal.SIGINT,):
+            process.send_signal(number)
+        output, _ = process.communicate(timeout=30)
+        self._processes.remove(process)
+        return process.returncode, output
+
+    def listen(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> list:
+        """The list that a topic's messages are appended to."""
+        messages: list = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def camera(self, namespace: str = "", qos: QoSProfile | int = 10) -> "Camera":
+        """Publishers of depth images and CameraInfo."""
+        return Camera(self, namespace, qos)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """A service's answer."""
+        client = self.node.create_client(kind, name)
+        self.wait_for(client.service_is_ready, f"service {name}")
+        future = client.call_async(request)
+        self.wait_for(future.done, f"the answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def wait_for(self, done: Callable[[], Any], what: str, seconds: float = 30.0, pause: float = 0.05) -> Any:
+        """Spin until `done` returns something true, and return it."""
+        deadline = time.monotonic() + seconds
+        while not (result := done()):
+            self._fail_for_the_dead(what)
+            if time.monotonic() > deadline:
+                pytest.fail(f"{what} did not come within {seconds} s")
+            self._executor.spin_once(timeout_sec=pause)
+        return result
+
+    def wait_for_diagnosis(
+        self, diagnostics: list[DiagnosticArray], text: str, name: str = "/scene_parser: scene parsing"
+    ) -> DiagnosticArray:
+        """The first report from now on of a node whose message holds a text."""
+        del diagnostics[:]
+
+        def found() -> DiagnosticArray | None:
+            return next((d for d in diagnostics if d.status[0].name == name and text in d.status[0].message), None)
+
+        deadline = time.monotonic() + 30
+        while (report := found()) is None:
+            if time.monotonic() > deadline:
+                seen = sorted({f"{d.status[0].name}: {d.status[0].message}" for d in diagnostics})
+                pytest.fail(f"no diagnosis with {text!r}; seen: {seen}")
+            self._fail_for_the_dead(f"the diagnosis {text!r}")
+            self._executor.spin_once(timeout_sec=0.05)
+        return report
+
+    def _fail_for_the_dead(self, what: str) -> None:
+        for process in self._processes:
+            if process.poll() not in (None, 0):
+                pytest.fail(f"a process died, waiting for {what}:\n{process.communicate()[0]}")
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.communicate()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+class Camera:
+    """Publishes depth images, 16UC1, and CameraInfo."""
+
+    def __init__(self, ros: Ros, namespace: str, qos: QoSProfile | int) -> None:
+        self._ros = ros
+        self._image = ros.node.create_publisher(Image, f"{namespace}/depth/image_rect", qos)
+        self._info = ros.node.create_publisher(CameraInfo, f"{namespace}/depth/camera_info", qos)
+
+    def wait_for_subscriber(self) -> None:
+        """Wait until somebody subscribes to both."""
+        for publisher in (self._image, self._info):
+            self._ros.wait_for(publisher.get_subscription_count, f"a subscriber of {publisher.topic}", seconds=60)
+
+    def messages(self, frame: DepthFrame) -> tuple[Image, CameraInfo]:
+        """The messages of a frame."""
+        header = Header(stamp=ns_to_stamp(frame.stamp_ns), frame_id=frame.frame_id)
+        pixels = np.frombuffer(encode_depth(frame.depth, "16UC1"), np.uint16).reshape(frame.depth.shape)
+        i = frame.intrinsics
+        info = CameraInfo(header=header, width=i.width, height=i.height)
+        info.k = [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0]
+        return image_message(pixels, "16UC1", header), info
+
+    def send(self, image: Image, info: CameraInfo | None) -> None:
+        """Publish an image and the CameraInfo it comes with, if any."""
+        if info is not None:
+            self._info.publish(info)
+        self._image.publish(image)
+
+    def publish(self, frame: DepthFrame) -> None:
+        """Publish a frame."""
+        self.send(*self.messages(frame))
+
+
+@pytest.fixture
+def ros() -> Iterator[Ros]:
+    """A domain for one test."""
+    session = Ros()
+    yield session
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def shared_ros() -> Iterator[Ros]:
+    """A domain for all tests of a module."""
+    session = Ros()
+    yield session
+    session.close()
+
+
+@pytest.fixture(scope="session")
+def library_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two boxes."""
+    folder = tmp_path_factory.mktemp("library")
+    for name, size in (("brick", (0.06, 0.1, 0.2)), ("cube", (0.08, 0.08, 0.08))):
+        save_model(model_from_mesh(trimesh.creation.box(size), name, 0.01), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def library(library_folder: Path):
+    return load_library(library_folder)

@@ -1,0 +1,69 @@
+"""The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] --ros-args ...`."""
+
+import sys
+import threading
+
+import numpy as np
+
+from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
+from bayes3d_ros.ros.scene_parser import SceneParserNode
+from bayes3d_ros.ros.spinning import run
+
+
+class FakeParser:
+    """Answers every frame with one object of type 0, one metre ahead (or at the camera pose's height)."""
+
+    seconds = 0.0
+
+    def __init__(self, library: Library, settings: ParserSettings) -> None:
+        self.library, self.settings = library, settings
+
+    def warm_up(self, width: int, height: int) -> None:
+        pass
+
+    def parse(self, frame: DepthFrame) -> ScenePosterior:
+        threading.Event().wait(self.seconds)
+        if not np.isfinite(frame.depth).any():
+            raise ParseError("depth image: no pixel has a return")
+        if self.settings.table == "pose" and frame.T_table_camera is None:
+            raise ParseError("table is 'pose' and the frame has no camera pose")
+        z = 1.0 if frame.T_table_camera is None else float(frame.T_table_camera[2, 3])
+        position, orientation = np.array([0.0, 0.1, z]), np.array([0.0, 0.0, 0.0, 1.0])
+        samples = SceneSamples(  # two samples: one object, none
+            log_weight=np.log([0.75, 0.25]),
+            num_objects=np.array([1, 0]),
+            type=np.array([[0], [-1]]),
+            face=np.array([[5], [-1]]),
+            position=np.stack([position, position])[:, None],
+            orientation=np.stack([orientation, orientation])[:, None],
+            p_outlier=np.full(2, 0.05),
+            sigma=np.full(2, 0.002),
+        )
+        name = self.library.names[0]
+        estimate = ObjectEstimate(name, {name: 1.0}, 0.75, position, orientation, np.diag([1e-6] * 6), 5)
+        return ScenePosterior(
+            stamp_ns=frame.stamp_ns,
+            frame_id=frame.frame_id,
+            types=self.library.names,
+            objects=(estimate,),
+            num_objects={0: 0.25, 1: 0.75},
+            p_outlier=0.05,
+            sigma=0.002,
+            log_evidence=12.5,
+            samples=samples,
+            reconstruction=frame.depth,
+            segmentation=np.isfinite(frame.depth).astype(np.uint16),
+            T_camera_table=np.eye(4),
+            ess=(1.0, 0.5),
+            seconds=self.seconds,
+        )
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:]
+    if arguments[:1] == ["--seconds"]:
+        FakeParser.seconds = float(arguments[1])
+    sys.exit(run(lambda: SceneParserNode(FakeParser), sys.argv))

@@ -1,0 +1,143 @@
+from collections.abc import Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.parameters import (
+    SCENE_PARSER_SETTINGS,
+    SceneParserNodeSettings,
+    SettingsParameters,
+    describe,
+    yaml_text,
+)
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[rclpy.Context]:
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def declared(context: rclpy.Context, request: pytest.FixtureRequest) -> Iterator[tuple[Node, SettingsParameters]]:
+    """A node with all parameters; `request.param` are the ROS arguments it is started with."""
+    arguments = ["--ros-args", *getattr(request, "param", [])]
+    node = Node("scene_parser", context=context, cli_args=arguments)
+    parameters = SettingsParameters(node, SCENE_PARSER_SETTINGS)
+    node.add_on_set_parameters_callback(parameters.check)
+    yield node, parameters
+    node.destroy_node()
+
+
+def with_values(*values: str) -> pytest.param:
+    return [word for value in values for word in ("-p", value)]
+
+
+def test_the_yaml_file_is_in_step_with_the_settings() -> None:
+    file = share_directory() / "config" / "scene_parser.yaml"
+    expected = yaml_text("scene_parser", SCENE_PARSER_SETTINGS)
+    assert file.read_text() == expected, f"python -m bayes3d_ros.ros.parameters > {file}"
+    values = yaml.safe_load(expected)["/**/scene_parser"]["ros__parameters"]
+    assert values.keys() == {f.name for kind in SCENE_PARSER_SETTINGS for f in fields(kind)}
+    assert {k: values[k] for k in asdict(ParserSettings())} == asdict(ParserSettings())
+
+
+def test_defaults_are_the_settings_defaults(declared: tuple[Node, SettingsParameters]) -> None:
+    _, parameters = declared
+    assert parameters.read(ParserSettings) == ParserSettings()
+    assert parameters.read(SceneParserNodeSettings) == SceneParserNodeSettings()
+
+
+def test_every_parameter_is_described_with_its_unit_and_range() -> None:
+    for kind in SCENE_PARSER_SETTINGS:
+        for field in fields(kind):
+            descriptor = describe(field)
+            assert field.metadata["description"] in descriptor.description
+            assert field.metadata["unit"] in descriptor.description
+            ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
+            if field.metadata["low"] is not None:
+                assert ranges[0].from_value == pytest.approx(field.metadata["low"])
+            if field.metadata["high"] is not None:
+                assert ranges[0].to_value == pytest.approx(field.metadata["high"])
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [with_values("far:=3", "camera_pose:=[0, 0, 1, 1, 0, 0, 0]", "max_objects:=2")],
+    indirect=True,
+)
+def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, SettingsParameters]) -> None:
+    _, parameters = declared
+    assert parameters.read(ParserSettings) == ParserSettings(far=3.0, max_objects=2)
+    assert parameters.read(SceneParserNodeSettings).camera_pose == (0, 0, 1, 1, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [
+        with_values("max_objects:=77"),
+        with_values("max_objects:=many"),
+        with_values("sigma_max:=0.0"),
+        with_values("sigma_max:=thick"),
+        with_values("table:=chair"),
+        with_values("window:=4"),
+        with_values("near:=6.0"),
+        with_values("camera_pose:=[1.0, 2.0]"),
+        with_values("camera_pose:=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]"),
+        with_values("qos_reliability:=perhaps"),
+        with_values("autostart:=3"),
+        with_values("library:=5"),
+    ],
+    indirect=True,
+    ids=lambda words: words[1],
+)
+def test_a_bad_value_at_the_start_is_named_in_one_line_and_the_node_lives(
+    declared: tuple[Node, SettingsParameters], request: pytest.FixtureRequest
+) -> None:
+    _, parameters = declared
+    name = request.node.callspec.params["declared"][1].split(":=")[0]
+    with pytest.raises(ValueError, match=f"parameter {name}") as error:
+        for kind in SCENE_PARSER_SETTINGS:
+            parameters.read(kind)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("declared", [with_values("max_objects:=77")], indirect=True)
+def test_setting_a_bad_parameter_right_cures_it(declared: tuple[Node, SettingsParameters]) -> None:
+    node, parameters = declared
+    assert node.set_parameters([Parameter("max_objects", value=3)])[0].successful
+    assert parameters.read(ParserSettings).max_objects == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("window", 4), ("far", 0.05), ("sigma_max", -1), ("table", "chair"), ("far", float("nan")), ("particles", 0)],
+)
+def test_a_bad_value_later_is_rejected_and_nothing_changes(
+    declared: tuple[Node, SettingsParameters], name: str, value: object
+) -> None:
+    node, parameters = declared
+    result = node.set_parameters([Parameter(name, value=value)])[0]
+    assert not result.successful and name in result.reason
+    assert parameters.read(ParserSettings) == ParserSettings()
+
+
+def test_a_parameter_file_reaches_a_node_in_a_namespace(context: rclpy.Context, tmp_path: Path) -> None:
+    text = yaml_text("scene_parser", SCENE_PARSER_SETTINGS).replace("max_objects: 8", "max_objects: 5")
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    arguments = ["--ros-args", "--params-file", str(file)]
+    node = Node("scene_parser", namespace="robot/arm", context=context, cli_args=arguments)
+    parameters = SettingsParameters(node, SCENE_PARSER_SETTINGS)
+    assert parameters.read(ParserSettings) == ParserSettings(max_objects=5)
+    assert parameters.read(SceneParserNodeSettings) == SceneParserNodeSettings()
+    node.destroy_node()

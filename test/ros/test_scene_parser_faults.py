@@ -1,0 +1,199 @@
+"""What is wrong with the input is said in one line on /diagnostics, and the node goes on."""
+
+import array
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_image import encode_depth
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.ros import conversions
+
+INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
+SECOND = 1_000_000_000
+
+
+def depth_frame(stamp_ns: int) -> DepthFrame:
+    return DepthFrame(np.full((48, 64), 0.75, np.float32), INTRINSICS, stamp_ns, "camera")
+
+
+class Bench:
+    """A running node that is fed one frame after the other; stamps always increase, unless told otherwise."""
+
+    def __init__(self, ros) -> None:
+        self.ros, self.camera, self.stamp = ros, ros.camera(), SECOND
+        self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+        self.poses = ros.listen(PoseArray, "/scene_parser/poses")
+
+    def messages(self) -> tuple[Image, CameraInfo]:
+        self.stamp += SECOND
+        return self.camera.messages(depth_frame(self.stamp))
+
+    def good_frame_is_parsed(self) -> None:
+        image, info = self.messages()
+        self.is_parsed(image, info)
+
+    def is_parsed(self, image: Image, info: CameraInfo | None) -> None:
+        stamp = conversions.stamp_to_ns(image.header.stamp)
+        count = len(self.poses)
+        self.camera.send(image, info)
+        self.ros.wait_for(lambda: len(self.poses) > count, "an output")
+        assert conversions.stamp_to_ns(self.poses[-1].header.stamp) == stamp
+
+    def is_refused(self, image: Image, info: CameraInfo, why: str) -> None:
+        count = len(self.poses)
+        self.camera.send(image, info)
+        report = self.ros.wait_for_diagnosis(self.diagnostics, why)
+        assert "\n" not in report.status[0].message
+        assert len(self.poses) == count
+
+
+@pytest.fixture(scope="module")
+def bench(shared_ros, library_folder: Path) -> Iterator[Bench]:
+    process = shared_ros.start_parser(library_folder)
+    bench = Bench(shared_ros)
+    bench.camera.wait_for_subscriber()
+    yield bench
+    status, output = shared_ros.stop(process)
+    assert status == 0, output
+    assert "Traceback" not in output
+
+
+def test_no_camera_info_yet(bench: Bench) -> None:
+    image, _ = bench.messages()
+    bench.camera.send(image, None)
+    bench.ros.wait_for_diagnosis(bench.diagnostics, "no message yet on /depth/camera_info")
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"encoding": "rgb8"}, "Image encoding: expected one of"),
+        ({"step": 100}, "Image step: expected at least 128"),
+        ({"step": 130}, "Image data: expected 6240 bytes"),
+        ({"data": array.array("B", b"1234")}, "Image data: expected 6144 bytes"),
+        ({"data": array.array("B", bytes(6144))}, "no pixel has a return"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_bad_image(bench: Bench, changes: dict, why: str) -> None:
+    image, info = bench.messages()
+    for field, value in changes.items():
+        setattr(image, field, value)
+    bench.is_refused(image, info, why)
+    bench.good_frame_is_parsed()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_a_float_image_without_a_return(bench: Bench, value: float) -> None:
+    image, info = bench.messages()
+    image.encoding, image.step = "32FC1", 256
+    image.data = array.array("B", np.full((48, 64), value, np.float32).tobytes())
+    bench.is_refused(image, info, "no pixel has a return")
+    bench.good_frame_is_parsed()
+
+
+def test_big_endian_images_are_read(bench: Bench) -> None:
+    image, info = bench.messages()
+    image.is_bigendian = 1
+    image.data = array.array("B", encode_depth(depth_frame(0).depth, "16UC1", is_bigendian=True))
+    bench.is_parsed(image, info)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"), [({"k": np.zeros(9), "p": np.zeros(12)}, "K[0]"), ({"width": 32}, "expected the image's 64x48")]
+)
+def test_a_bad_camera_info(bench: Bench, changes: dict, why: str) -> None:
+    image, info = bench.messages()
+    for field, value in changes.items():
+        setattr(info, field, value)
+    bench.is_refused(image, info, why)
+    bench.good_frame_is_parsed()
+
+
+def test_camera_info_of_another_stamp_serves_after_a_moment(bench: Bench) -> None:
+    bench.good_frame_is_parsed()
+    image, _ = bench.messages()
+    bench.is_parsed(image, None)
+    del bench.diagnostics[:]
+    bench.ros.wait_for(lambda: bench.diagnostics, "a report")
+    notes = {v.key: v.value for v in bench.diagnostics[0].status[0].values}["notes"]
+    assert "CameraInfo has other stamps" in notes
+    bench.good_frame_is_parsed()
+
+
+def test_stamps_that_go_backwards(bench: Bench) -> None:
+    for stamp in (500 * SECOND, 501 * SECOND, 3 * SECOND, 4 * SECOND):
+        bench.is_parsed(*bench.camera.messages(depth_frame(stamp)))
+
+
+def test_a_changed_setting_is_checked_and_taken(bench: Bench) -> None:
+    def set_parameter(name: str, value: object):
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return bench.ros.call(SetParameters, "/scene_parser/set_parameters", request).results[0]
+
+    assert "max_objects" in set_parameter("max_objects", 99).reason
+    assert "deactivate" in set_parameter("qos_reliability", "best_effort").reason
+    assert set_parameter("table", "pose").successful  # no pose comes with these frames
+    bench.is_refused(*bench.messages(), "no camera pose")
+    assert set_parameter("table", "auto").successful
+    bench.good_frame_is_parsed()
+
+
+def test_a_best_effort_publisher_is_heard(ros, library_folder: Path) -> None:
+    best_effort = ros.camera("/other", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    ros.start(
+        str(Path(__file__).parent / "fake_scene_parser.py"),
+        *["--ros-args", "-r", "__ns:=/other", "-p", f"library:={library_folder}"],
+    )
+    poses = ros.listen(PoseArray, "/other/scene_parser/poses")
+    best_effort.wait_for_subscriber()
+    ros.wait_for(lambda: best_effort.publish(depth_frame(SECOND)) or poses, "an output", pause=0.2)
+
+
+def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, library_folder: Path, tmp_path: Path) -> None:
+    name = "/late/scene_parser"
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    names = ros.listen(String, f"{name}/library")
+    folder = tmp_path / "library"
+    ros.start(
+        str(Path(__file__).parent / "fake_scene_parser.py"),
+        *["--ros-args", "-r", "__ns:=/late", "-p", f"library:={folder}"],
+    )
+    mine = f"{name}: scene parsing"
+    ros.wait_for_diagnosis(diagnostics, "no such library folder", mine)
+    reload = f"{name}/reload_library"
+    answer = ros.call(Trigger, reload, Trigger.Request())
+    assert not answer.success and str(folder) in answer.message
+    folder.mkdir()
+    assert "holds no models" in ros.call(Trigger, reload, Trigger.Request()).message
+    (folder / "brick.npz").write_bytes(b"not an archive")
+    assert "brick.npz" in ros.call(Trigger, reload, Trigger.Request()).message
+    shutil.copytree(library_folder, folder, dirs_exist_ok=True)
+    assert ros.call(Trigger, reload, Trigger.Request()).success
+    ros.wait_for(lambda: names and names[-1].data == "brick\ncube", "the library")
+    (folder / "cube.npz").unlink()
+    assert ros.call(Trigger, reload, Trigger.Request()).success
+    ros.wait_for(lambda: names[-1].data == "brick", "the smaller library")
+
+    # A lifecycle manager can stop it and start it again.
+    change = f"{name}/change_state"
+    for transition, label in ((4, "inactive"), (2, "unconfigured"), (1, "inactive"), (3, "active")):
+        request = ChangeState.Request()
+        request.transition.id = transition
+        assert ros.call(ChangeState, change, request).success
+        assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == label
+    ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
