@@ -117,7 +117,7 @@ def _parser_settings(more: tuple[str, ...], options: dict[str, Any]) -> "ParserS
 
     from bayes3d_ros.inference.settings import ParserSettings
 
-    kinds = {f.name: type(f.default) for f in fields(ParserSettings)}
+    kinds: dict[str, type] = {f.name: type(f.default) for f in fields(ParserSettings)}
     chosen = {name: value for name, value in options.items() if value is not None}
     for text in more:
         name, _, value = text.partition("=")
@@ -143,7 +143,6 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
     from bayes3d_ros.inference.compilation import enable_cache
     from bayes3d_ros.inference.scene_parsing import SceneParser
     from bayes3d_ros.model.posterior import ParseError
-    from bayes3d_ros.model.summaries import summarise
 
     enable_cache()
     parser = SceneParser(library, settings)
@@ -160,8 +159,7 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
                 failed += 1
                 _say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
                 continue
-            summary = summarise(posterior.samples, posterior.types, settings.min_probability, library)
-            picture = results.write(frame.depth, posterior, summary.object_index)
+            picture = results.write(frame.depth, posterior)
             title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
             plot_scene(frame.depth, posterior, picture, title, camera)
             _say(_frame_line(posterior))

@@ -44,7 +44,8 @@ def fake_posterior() -> Callable[..., ScenePosterior]:
             stamp_ns=frame.stamp_ns, frame_id=frame.frame_id, types=types, objects=summary.objects,
             num_objects=summary.num_objects, p_outlier=summary.p_outlier, sigma=summary.sigma, log_evidence=120.5,
             samples=samples, reconstruction=np.nan_to_num(frame.depth, nan=1.0), segmentation=segmentation,
-            T_camera_table=np.eye(4), ess=(1.0, 0.5), seconds=0.25, notes=("made up",),
+            T_camera_table=np.eye(4), ess=(1.0, 0.5), seconds=0.25, object_index=summary.object_index,
+            notes=("made up",),
         )  # fmt: skip
 
     return posterior

@@ -87,20 +87,8 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
 
 
 def test_options_become_settings(bag, library, parsers, tmp_path):
-    options = [
-        "--table",
-        "depth",
-        "--seed",
-        "7",
-        "--particles",
-        "33",
-        "--max-objects",
-        "2",
-        "--set",
-        "sigma_max=0.004",
-        "--set",
-        "window=3",
-    ]
+    options = ["--table", "depth", "--seed", "7", "--particles", "33", "--max-objects", "2"]
+    options += ["--set", "sigma_max=0.004", "--set", "window=3"]
     assert run("parse", bag, "--library", library, "--out", tmp_path / "out", *options).exit_code == 0
     settings = parsers.made[0].settings
     assert (settings.table, settings.seed, settings.particles, settings.max_objects) == ("depth", 7, 33, 2)

@@ -21,8 +21,8 @@ from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.model.objects import Library, load_library
 from bayes3d_ros.resources import share_directory
 
-ONE_TYPE = ("004_sugar_box",)
-TEN_TYPES = (
+ONE_TYPE: tuple[str, ...] = ("004_sugar_box",)
+TEN_TYPES: tuple[str, ...] = (
     "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "010_potted_meat_can",
     "011_banana", "019_pitcher_base", "024_bowl", "025_mug", "035_power_drill",
 )  # fmt: skip

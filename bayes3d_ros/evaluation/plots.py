@@ -130,9 +130,17 @@ def _samples_panel(
         if own.any():
             alpha = np.clip(weight[own] / weight[own].max(), 0.08, 1.0) if k >= 0 else np.clip(weight[own], 0.08, 1.0)
             tone, marker = (colour(k + 1), "o") if k >= 0 else (OTHER, "x")
-            axis.scatter(*place[own].T, s=9 if k >= 0 else 22, color=tone, alpha=alpha, marker=marker, linewidths=0.8)
+            axis.scatter(
+                place[own, 0],
+                place[own, 1],
+                s=9 if k >= 0 else 22,
+                color=tone,
+                alpha=alpha,
+                marker=marker,
+                linewidths=0.8,
+            )
     for k in range(len(posterior.objects)):
-        _number(axis, *centres[k], k + 1, offset=(13, 13))
+        _number(axis, centres[k, 0], centres[k, 1], k + 1, offset=(13, 13))
 
     around = np.concatenate([centres, place[weight > 0.05]]) if len(place) else centres
     around = around[np.isfinite(around).all(1)] if len(around) else np.zeros((1, 2))

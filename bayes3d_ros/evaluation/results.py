@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.lib import format as npy
 
 from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
@@ -78,27 +78,24 @@ class ResultsWriter:
             raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
         return self
 
-    def write(
-        self,
-        depth: Float[np.ndarray, "height width"],
-        posterior: ScenePosterior,
-        object_index: Int[np.ndarray, "S M"],
-    ) -> Path:
+    def write(self, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Path:
         """Append a frame; depth is what was parsed, in metres. Returns where the frame's PNG belongs."""
+        if posterior.object_index is None:
+            raise ValueError("posterior.object_index is needed to write samples")
         try:
             path = self.folder / FRAMES / f"{posterior.stamp_ns}.npz"
-            arrays = {
-                "depth": np.asarray(depth, np.float32),
-                "reconstruction": np.asarray(posterior.reconstruction, np.float32),
-                "segmentation": np.asarray(posterior.segmentation, np.uint16),
-            }
             temporary = path.with_name(f".{path.name}.tmp")
             with temporary.open("wb") as file:
-                np.savez_compressed(file, **arrays)
+                np.savez_compressed(
+                    file,
+                    depth=np.asarray(depth, np.float32),
+                    reconstruction=np.asarray(posterior.reconstruction, np.float32),
+                    segmentation=np.asarray(posterior.segmentation, np.uint16),
+                )
             os.replace(temporary, path)
-            rows = posterior_rows(posterior.samples, object_index)
+            rows = posterior_rows(posterior.samples, posterior.object_index)
             framed = np.zeros(len(rows), _ROW)
-            for name in rows.dtype.names:
+            for name, _ in POSTERIOR_FIELDS:
                 framed[name] = rows[name]
             framed["frame"] = self.frames
             self._rows.write(framed.tobytes())

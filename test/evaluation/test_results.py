@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.evaluation.results import ResultsError, ResultsWriter, scene_record
-from bayes3d_ros.model.summaries import posterior_rows, summarise
+from bayes3d_ros.model.summaries import posterior_rows
 
 TYPES = ("bowl", "can", "mug")
 KEYS = [
@@ -26,10 +26,9 @@ def written(tmp_path, depth_frame, fake_posterior):
         for stamp, objects in ((10**18 + 5, 2), (10**18 + 6, 0), (10**18 + 7, 3)):
             frame = depth_frame(stamp)
             posterior = fake_posterior(frame, TYPES, objects)
-            index = summarise(posterior.samples, TYPES, 0.5).object_index
-            picture = results.write(frame.depth, posterior, index)
+            picture = results.write(frame.depth, posterior)
             assert picture == tmp_path / "out" / "frames" / f"{stamp}.png"
-            pairs.append((frame, posterior, index))
+            pairs.append((frame, posterior))
     return tmp_path / "out", pairs
 
 
@@ -37,7 +36,7 @@ def test_a_line_a_frame(written):
     folder, pairs = written
     lines = [json.loads(text) for text in (folder / "scenes.jsonl").read_text().splitlines()]
     assert len(lines) == 3
-    for line, (_, posterior, _) in zip(lines, pairs, strict=True):
+    for line, (_, posterior) in zip(lines, pairs, strict=True):
         assert list(line) == KEYS
         assert line["stamp_ns"] == posterior.stamp_ns and line["size"] == [64, 48]
         assert sum(line["num_objects"].values()) == pytest.approx(1.0)
@@ -52,7 +51,7 @@ def test_samples_are_the_posterior_rows_of_all_frames(written):
     folder, pairs = written
     samples = np.load(folder / "samples.npz", allow_pickle=False)
     assert samples["types"].tolist() == list(TYPES)
-    expected = [posterior_rows(posterior.samples, index) for _, posterior, index in pairs]
+    expected = [posterior_rows(posterior.samples, posterior.object_index) for _, posterior in pairs]
     assert samples["frame"].tolist() == [k for k, rows in enumerate(expected) for _ in rows]
     for name in expected[0].dtype.names:
         np.testing.assert_array_equal(samples[name], np.concatenate([rows[name] for rows in expected]))
@@ -61,7 +60,7 @@ def test_samples_are_the_posterior_rows_of_all_frames(written):
 
 def test_frames_hold_the_images(written):
     folder, pairs = written
-    for frame, posterior, _ in pairs:
+    for frame, posterior in pairs:
         arrays = np.load(folder / "frames" / f"{frame.stamp_ns}.npz")
         np.testing.assert_array_equal(arrays["depth"], frame.depth)
         np.testing.assert_array_equal(arrays["segmentation"], posterior.segmentation)
@@ -71,18 +70,17 @@ def test_frames_hold_the_images(written):
 def test_the_same_posteriors_give_the_same_bytes(written, tmp_path):
     folder, pairs = written
     with ResultsWriter(tmp_path / "again", TYPES) as results:
-        for frame, posterior, index in pairs:
-            results.write(frame.depth, posterior, index)
-    for name in ("scenes.jsonl", "samples.npz", *(f"frames/{frame.stamp_ns}.npz" for frame, _, _ in pairs)):
+        for frame, posterior in pairs:
+            results.write(frame.depth, posterior)
+    for name in ("scenes.jsonl", "samples.npz", *(f"frames/{frame.stamp_ns}.npz" for frame, _ in pairs)):
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
 def test_an_interrupted_run_keeps_what_was_finished(tmp_path, depth_frame, fake_posterior):
     frame = depth_frame()
     posterior = fake_posterior(frame, TYPES)
-    index = summarise(posterior.samples, TYPES, 0.5).object_index
     with pytest.raises(KeyboardInterrupt), ResultsWriter(tmp_path, TYPES) as results:
-        results.write(frame.depth, posterior, index)
+        results.write(frame.depth, posterior)
         assert (tmp_path / "scenes.jsonl").read_text().endswith("}\n")  # already there, were the process killed now
         raise KeyboardInterrupt
     assert set(np.load(tmp_path / "samples.npz")["frame"]) == {0}
