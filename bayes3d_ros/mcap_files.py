@@ -5,6 +5,7 @@ before the damage. Errors are one line that names the file and what was expected
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,8 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Topic(NamedTuple):
+@dataclass(frozen=True)
+class Topic:
     """A recorded topic with `count` messages."""
 
     name: str

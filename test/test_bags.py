@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -142,13 +144,22 @@ def test_a_cut_file_gives_the_frames_before_the_cut_then_one_line(tmp_path):
     assert {0, 4} < delivered
 
 
-def test_a_flipped_byte_is_noticed(bag):
-    file = bag / "bag.mcap"
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 0xFF  # in the compressed images
-    file.write_bytes(data)
-    with pytest.raises(BagError, match="truncated or damaged"):
-        list(read_frames(bag))
+def test_a_flipped_byte_is_noticed_where_the_writer_kept_checksums(tmp_path):
+    file = tmp_path / "x.mcap"
+    data = STORE.serialize_cdr(image(), "sensor_msgs/msg/Image")
+    with file.open("wb") as stream:  # the rosbags writer keeps none
+        writer = McapWriter(stream, compression=CompressionType.NONE)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
+        channel = writer.register_channel("/d/image_rect", "cdr", schema)
+        writer.add_message(channel, START, bytes(data), START)
+        writer.finish()
+    assert [m.data for m in raw_messages(file)] == [bytes(data)]
+    damaged = bytearray(file.read_bytes())
+    damaged[len(damaged) // 2] ^= 0xFF
+    file.write_bytes(damaged)
+    with pytest.raises(BagDamage, match="truncated or damaged after 0 readable messages"):
+        list(raw_messages(file))
 
 
 @pytest.mark.parametrize("content", [b"", b"not an mcap file at all", b"SQLite format 3\0"])

@@ -97,29 +97,30 @@ def _scene(path: Path, content: Any) -> Scene:
     keys = ("seed", "rate", "start", "camera", "table", "objects", "noise")
     top = _mapping(content, "the scene", keys)
     camera = _mapping(top.get("camera", {}), "camera", ("intrinsics", "eye", "target", "frames", "step"))
-    intrinsics = _mapping(camera.get("intrinsics", {}), "camera.intrinsics", tuple(_INTRINSICS))
-    values = {
-        key: _number(intrinsics.get(key, default), f"camera.intrinsics.{key}") for key, default in _INTRINSICS.items()
-    }
-    values |= {key: int(values[key]) for key in ("width", "height")}
+    pinhole = _INTRINSICS | _mapping(camera.get("intrinsics"), "camera.intrinsics", tuple(_INTRINSICS))
+    fx, fy, cx, cy = (_number(pinhole[key], f"camera.intrinsics.{key}") for key in ("fx", "fy", "cx", "cy"))
+    columns, rows = (_whole(pinhole[key], f"camera.intrinsics.{key}", 1) for key in ("width", "height"))
     table = _mapping(top.get("table", {}), "table", ("size", "height"))
     noise = _mapping(top.get("noise", {}), "noise", tuple(f.name for f in fields(SensorNoise)))
-    objects = top.get("objects", [])
+    objects = [] if top.get("objects") is None else top["objects"]
     if not isinstance(objects, list):
         raise ValueError(f"objects: expected a list, got {objects!r}")
     rate = _number(top.get("rate", 10), "rate")
     if rate <= 0:
         raise ValueError(f"rate: expected frames a second > 0, got {rate}")
     size = _vector(table.get("size", [1.2, 0.8]), "table.size", 2)
+    height = _number(table.get("height", 0.75), "table.height")
+    if not (size > 0).all() or height <= 0:
+        raise ValueError(f"table: expected a size and a height > 0, got size {size.tolist()}, height {height}")
     return Scene(
         path=path,
-        seed=int(_number(top.get("seed", 0), "seed")),
+        seed=_whole(top.get("seed", 0), "seed", 0),
         rate=rate,
         start_ns=round(_number(top.get("start", 1_700_000_000), "start")) * 10**9,
-        intrinsics=Intrinsics(**values),
+        intrinsics=Intrinsics(fx, fy, cx, cy, columns, rows),
         cameras=_cameras(camera),
         table_size=(size[0], size[1]),
-        table_height=_number(table.get("height", 0.75), "table.height"),
+        table_height=height,
         objects=tuple(_object(entry, f"objects[{i}]", path.parent) for i, entry in enumerate(objects)),
         noise=SensorNoise(**{key: _number(value, f"noise.{key}") for key, value in noise.items()}),
     )
@@ -135,7 +136,7 @@ def _cameras(camera: dict[str, Any]) -> tuple[np.ndarray, ...]:
         views = [default | _mapping(f, f"camera.frames[{i}]", ("eye", "target")) for i, f in enumerate(frames)]
         steps = np.zeros(3)
     else:
-        count = int(_number(frames, "camera.frames"))
+        count = _whole(frames, "camera.frames", 1)
         views, steps = [default] * count, _vector(camera.get("step", [0, 0, 0]), "camera.step", 3)
     if not views:
         raise ValueError("camera.frames: expected at least one frame")
@@ -182,6 +183,12 @@ def _mapping(value: Any, where: str, keys: tuple[str, ...]) -> dict[str, Any]:
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise ValueError(f"{where}: expected a number, got {value!r}")
+    return value
+
+
+def _whole(value: Any, where: str, low: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < low:
+        raise ValueError(f"{where}: expected a whole number >= {low}, got {value!r}")
     return value
 
 

@@ -13,7 +13,11 @@ from jaxtyping import Float
 from bayes3d_ros.geometry.camera import Intrinsics
 
 BytesLike = bytes | bytearray | memoryview | array.array | np.ndarray
-_PIXEL = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
+_PIXEL: dict[str, np.dtype] = {
+    "16UC1": np.dtype(np.uint16),
+    "mono16": np.dtype(np.uint16),
+    "32FC1": np.dtype(np.float32),
+}
 DEPTH_ENCODINGS = tuple(_PIXEL)
 
 
