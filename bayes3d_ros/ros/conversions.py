@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header, String
@@ -119,9 +119,11 @@ def reconstruction_image(posterior: ScenePosterior) -> Image:
     return image_message(posterior.reconstruction.astype(np.float32), "32FC1", header(posterior))
 
 
-def posterior_cloud(posterior: ScenePosterior, object_index: Int[np.ndarray, "S M"]) -> PointCloud2:
+def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
     """A point per object per sample; a sample without objects is one point with object = -1 (model/summaries.py)."""
-    return cloud_message(posterior_rows(posterior.samples, object_index), header(posterior))
+    if posterior.object_index is None:
+        raise ValueError("posterior: expected object_index, it says which object of a sample is which")
+    return cloud_message(posterior_rows(posterior.samples, posterior.object_index), header(posterior))
 
 
 def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:

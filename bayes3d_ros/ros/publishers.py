@@ -12,7 +12,6 @@ from visualization_msgs.msg import MarkerArray
 
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.posterior import ScenePosterior
-from bayes3d_ros.model.summaries import summarise
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.detections import detection_array, detections_type
 from bayes3d_ros.ros.markers import SceneMarkers
@@ -43,13 +42,12 @@ class ScenePublishers:
         """Publish the names of the types."""
         self._library.publish(conversions.library_message(library.names))
 
-    def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers, min_probability: float) -> None:
+    def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers) -> None:
         """Publish a scene on every topic."""
-        summary = summarise(posterior.samples, posterior.types, min_probability, library)
         self._poses.publish(conversions.pose_array(posterior))
         self._segmentation.publish(conversions.segmentation_image(posterior))
         self._reconstruction.publish(conversions.reconstruction_image(posterior))
-        self._posterior.publish(conversions.posterior_cloud(posterior, summary.object_index))
+        self._posterior.publish(conversions.posterior_cloud(posterior))
         if self._objects.get_subscription_count():  # thousands of points as Python objects
             self._objects.publish(markers(posterior))
         if self._detections is not None:

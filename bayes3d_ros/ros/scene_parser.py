@@ -258,11 +258,15 @@ class SceneParserNode(Node):
             return
         try:
             frame = frame_from_messages(messages.image, messages.info, messages.T_table_camera)
-            posterior = ready.parser.parse(frame)
-        except (ValueError, ParseError) as error:
-            self._problem(_one_line(error, named=False))
+        except ValueError as error:
+            self._problem(str(error))
             return
-        self._outputs.scene(posterior, ready.parser.library, ready.markers, ready.parser.settings.min_probability)
+        try:
+            posterior = ready.parser.parse(frame)
+        except ParseError as error:
+            self._problem(str(error))
+            return
+        self._outputs.scene(posterior, ready.parser.library, ready.markers)
         self._health.output(posterior, time.monotonic() - messages.arrived)
 
     def _worker_failed(self, error: Exception) -> None:
@@ -306,9 +310,8 @@ class SceneParserNode(Node):
         return (WARN, why) if why else (OK, "parsing")
 
 
-def _one_line(error: Exception, named: bool = True) -> str:
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if named else text
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def main(args: list[str] | None = None) -> int:

@@ -2,9 +2,6 @@
 
 import os
 import signal
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,34 +18,21 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-import bayes3d_ros
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import load_library, save_model
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.ros.conversions import image_message, ns_to_stamp
+from bayes3d_ros.ros.processes import NodeProcess, free_domain
 
 HERE = Path(__file__).parent
-PACKAGE = Path(bayes3d_ros.__file__).parents[1]  # the processes import what the tests import
-
-
-def free_domain() -> int:
-    """A ROS domain without a participant on this machine: its discovery port can be bound."""
-    for k in range(100):
-        domain = 1 + (os.getpid() + k) % 100
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain))
-                return domain
-            except OSError:
-                continue
-    raise RuntimeError("no free ROS domain")
 
 
 class Ros:
     """A node of the test's own, and processes that it talks to."""
 
-    def __init__(self) -> None:
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
         self.domain = free_domain()
         self.context = rclpy.Context()
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -56,31 +40,19 @@ class Ros:
         self.node = Node("test", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        self._processes: list[subprocess.Popen] = []
+        self._processes: list[NodeProcess] = []
 
-    def start(self, *command: str) -> subprocess.Popen:
+    def start(self, *command: str) -> NodeProcess:
         """Start `python COMMAND...` on this domain."""
-        path = os.pathsep.join([str(PACKAGE), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain), "PYTHONPATH": path}
-        process = subprocess.Popen(
-            [sys.executable, *command], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+        process = NodeProcess(list(command), self.domain, self._logs / f"{len(self._processes)}.log")
         self._processes.append(process)
         return process
 
-    def start_parser(self, library: Path | str, *arguments: str, **parameters: Any) -> subprocess.Popen:
+    def start_parser(self, library: Path | str, *arguments: str, **parameters: Any) -> NodeProcess:
         """Start scene_parser with a fake parser. `arguments` come before the ROS arguments."""
         pairs = {"library": library, "patience": 0.2, **parameters}
         assignments = [word for name, value in pairs.items() for word in ("-p", f"{name}:={value}")]
         return self.start(str(HERE / "fake_scene_parser.py"), *arguments, "--ros-args", *assignments)
-
-    def stop(self, process: subprocess.Popen, *signals: int) -> tuple[int, str]:
-        """Send signals (default: SIGINT) and wait; exit status and all output."""
-        for number in signals or (signal.SIGINT,):
-            process.send_signal(number)
-        output, _ = process.communicate(timeout=30)
-        self._processes.remove(process)
-        return process.returncode, output
 
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> list:
         """The list that a topic's messages are appended to."""
@@ -131,13 +103,12 @@ class Ros:
 
     def _fail_for_the_dead(self, what: str) -> None:
         for process in self._processes:
-            if process.poll() not in (None, 0):
-                pytest.fail(f"a process died, waiting for {what}:\n{process.communicate()[0]}")
+            if process.status not in (None, 0):
+                pytest.fail(f"a process died, waiting for {what}:\n{process.output()}")
 
     def close(self) -> None:
         for process in self._processes:
-            process.kill()
-            process.communicate()
+            process.stop(signal.SIGKILL)
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
@@ -177,17 +148,17 @@ class Camera:
 
 
 @pytest.fixture
-def ros() -> Iterator[Ros]:
+def ros(tmp_path: Path) -> Iterator[Ros]:
     """A domain for one test."""
-    session = Ros()
+    session = Ros(tmp_path)
     yield session
     session.close()
 
 
 @pytest.fixture(scope="module")
-def shared_ros() -> Iterator[Ros]:
+def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
     """A domain for all tests of a module."""
-    session = Ros()
+    session = Ros(tmp_path_factory.mktemp("logs"))
     yield session
     session.close()
 

@@ -54,6 +54,7 @@ class FakeParser:
             sigma=0.002,
             log_evidence=12.5,
             samples=samples,
+            object_index=samples.type,
             reconstruction=frame.depth,
             segmentation=np.isfinite(frame.depth).astype(np.uint16),
             T_camera_table=np.eye(4),

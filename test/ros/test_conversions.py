@@ -134,6 +134,7 @@ def scene(names: tuple[str, ...]) -> ScenePosterior:
         sigma=summary.sigma,
         log_evidence=3.0,
         samples=samples,
+        object_index=summary.object_index,
         reconstruction=np.full(shape, np.nan, np.float32),
         segmentation=np.zeros(shape, np.uint16),
         T_camera_table=np.eye(4),
@@ -145,8 +146,7 @@ def scene(names: tuple[str, ...]) -> ScenePosterior:
 
 def test_the_posterior_cloud_holds_the_samples(library) -> None:
     posterior = scene(library.names)
-    index = summarise(posterior.samples, posterior.types, 0.5).object_index
-    cloud = conversions.posterior_cloud(posterior, index)
+    cloud = conversions.posterior_cloud(posterior)
     names = "x y z qx qy qz qw log_weight p_outlier sigma sample n object type face"
     assert " ".join(f.name for f in cloud.fields) == names
     assert [f.datatype for f in cloud.fields] == [PointField.FLOAT32] * 10 + [PointField.INT32] * 5

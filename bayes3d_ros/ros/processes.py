@@ -1,0 +1,59 @@
+"""Nodes in processes of their own, on a ROS domain that nobody else on this machine uses."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+
+def free_domain() -> int:
+    """A ROS domain without a participant on this machine: its discovery port can be bound."""
+    for k in range(100):
+        domain = 1 + (os.getpid() + k) % 100
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain))
+                return domain
+            except OSError:
+                continue
+    raise RuntimeError("expected a free ROS domain between 1 and 100, all are in use")
+
+
+class NodeProcess:
+    """`python ARGUMENTS...` on a domain, local to this machine; what it prints goes to a file."""
+
+    def __init__(self, arguments: list[str], domain: int, log: Path) -> None:
+        self.log = log
+        package = str(Path(__file__).resolve().parents[2])  # the child imports the package that this process imports
+        path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {
+            **os.environ,
+            "PYTHONPATH": path,
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        with log.open("w") as file:
+            self._process = subprocess.Popen(
+                [sys.executable, *arguments], env=environment, stdout=file, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def status(self) -> int | None:
+        """Exit status, None while it runs."""
+        return self._process.poll()
+
+    def stop(self, *signals: int, seconds: float = 30.0) -> int:
+        """Send signals (default: SIGINT), wait for the end (by force after a while); the exit status."""
+        for number in signals or (signal.SIGINT,):
+            self._process.send_signal(number)
+        try:
+            return self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+    def output(self) -> str:
+        """Everything it has printed."""
+        return self.log.read_text()

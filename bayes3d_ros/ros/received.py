@@ -1,0 +1,71 @@
+"""A posterior put together again from the messages of one stamp: what a subscriber can know."""
+
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import Image
+
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
+from bayes3d_ros.model.summaries import summarise
+from bayes3d_ros.ros.conversions import depth_from_image, rows_from_cloud, stamp_to_ns
+
+
+def stamp_of(message: Any) -> int:
+    """The stamp of an output in nanoseconds; a marker array has it in its markers."""
+    header = message.header if hasattr(message, "header") else message.markers[0].header
+    return stamp_to_ns(header.stamp)
+
+
+def samples_from_rows(rows: np.ndarray) -> SceneSamples:
+    """Weighted scenes from the rows of ~/posterior; an object's slot is its place among its sample's rows."""
+    sample, first, size = np.unique(rows["sample"], return_index=True, return_counts=True)
+    count, most = len(sample), int(max(rows["n"].max(initial=0), 1))
+    index = np.repeat(np.arange(count), size)
+    slot = np.arange(len(rows)) - np.repeat(first, size)  # rows are in the order of samples
+    kind, face = np.full((count, most), -1), np.full((count, most), -1)
+    position, orientation = np.zeros((count, most, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, most, 1))
+    held = rows["object"] >= 0
+    where = index[held], slot[held]
+    kind[where], face[where] = rows["type"][held], rows["face"][held]
+    position[where] = np.stack([rows[name][held] for name in ("x", "y", "z")], -1)
+    orientation[where] = np.stack([rows[name][held] for name in ("qx", "qy", "qz", "qw")], -1)
+    per_sample = {name: rows[name][first] for name in ("log_weight", "p_outlier", "sigma")}
+    return SceneSamples(
+        num_objects=rows["n"][first], type=kind, face=face, position=position, orientation=orientation, **per_sample
+    )
+
+
+def labels_from_image(image: Image) -> np.ndarray:
+    """The labels of ~/segmentation."""
+    return np.frombuffer(image.data, "<u2").reshape(image.height, image.width)
+
+
+def posterior_from_messages(messages: dict[str, Any], library: Library) -> ScenePosterior:
+    """The posterior from one stamp's messages, by topic name without `~/`.
+
+    The table's pose is not published: T_camera_table is NaN.
+    """
+    cloud = messages["posterior"]
+    samples = samples_from_rows(rows_from_cloud(cloud))
+    summary = summarise(samples, library.names, 0.5, library)
+    scene = messages["summary"].status[0]
+    values = {pair.key: pair.value for pair in scene.values}
+    return ScenePosterior(
+        stamp_ns=stamp_of(cloud),
+        frame_id=cloud.header.frame_id,
+        types=library.names,
+        objects=summary.objects[: len(messages["poses"].poses)],
+        num_objects=summary.num_objects,
+        p_outlier=summary.p_outlier,
+        sigma=summary.sigma,
+        log_evidence=float(values["log evidence"]),
+        samples=samples,
+        object_index=summary.object_index,
+        reconstruction=depth_from_image(messages["depth_reconstruction"]),
+        segmentation=labels_from_image(messages["segmentation"]),
+        T_camera_table=np.full((4, 4), np.nan),
+        ess=tuple(float(e) for e in values["ess"].split()),
+        seconds=float(values["ms"]) / 1e3,
+        notes=tuple(pair.value for pair in scene.values if pair.key == "note"),
+    )
