@@ -198,3 +198,8 @@ def test_help_does_not_load_what_is_heavy():
     )
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert loaded.strip() == "[]"
+
+
+def test_the_demo_without_ros_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bayes3d_ros.ros.demo", None)
+    assert_one_line(run("demo", "--out", tmp_path / "out"), 1, "ROS 2 Jazzy")

@@ -40,9 +40,7 @@ def plot_scene(
     if title:
         figure.suptitle(title, fontsize=13, color=INK)
     axes = figure.subplots(2, 3, width_ratios=(1, 1, 1.05))
-    valid = depth[np.isfinite(depth)]
-    low, high = np.percentile(valid, (1, 95)) if valid.size else (0.0, 1.0)
-    scale = Normalize(float(low), float(max(high, low + 0.05)))
+    scale = _depth_scale(depth, posterior)
 
     image = _depth_panel(axes[0, 0], depth, scale, "input depth (grey: no return)")
     _depth_panel(axes[0, 1], posterior.reconstruction, scale, "reconstruction")
@@ -53,6 +51,34 @@ def plot_scene(
     _words_panel(axes[1, 2], posterior)
     figure.savefig(path, dpi=100)
     return path
+
+
+def _depth_scale(depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Normalize:
+    """Over the table and what stands on it: a room behind it would leave no contrast for them."""
+    with np.errstate(invalid="ignore"):
+        tabletop = depth[depth < posterior.reconstruction + 0.05]
+    valid = tabletop if tabletop.size > 0.1 * depth.size else depth[np.isfinite(depth)]
+    low, high = np.percentile(valid, (1, 98)) if valid.size else (0.0, 1.0)
+    return Normalize(float(low), float(max(high, low + 0.05)))
+
+
+def _view_from_above(posterior: ScenePosterior, intrinsics: Intrinsics | None) -> Float[np.ndarray, "4 4"]:
+    """T_table_camera; where the posterior does not know the table, from the plane that the reconstruction shows."""
+    if np.isfinite(posterior.T_camera_table).all():
+        return np.linalg.inv(posterior.T_camera_table)
+    T_table_camera = np.eye(4)
+    bare = (posterior.segmentation == 0) & np.isfinite(posterior.reconstruction)
+    if intrinsics is None or bare.sum() < 3:  # along the camera's y
+        T_table_camera[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+        return T_table_camera
+    points = unproject(posterior.reconstruction, intrinsics)[bare].astype(float)
+    up = np.linalg.lstsq(points, np.ones(len(points)), rcond=None)[0]  # the plane's points have up . x = 1
+    up = -up / np.linalg.norm(up)
+    x = np.array([1.0, 0, 0]) - up[0] * up
+    x /= np.linalg.norm(x)
+    T_table_camera[:3, :3] = np.stack([x, np.cross(up, x), up])
+    T_table_camera[:3, 3] = -T_table_camera[:3, :3] @ points.mean(0)
+    return T_table_camera
 
 
 def colour(label: int) -> str:
@@ -103,7 +129,7 @@ def _samples_panel(
 ) -> None:
     """Origins of every sample's objects on the table's plane."""
     samples = posterior.samples
-    T_table_camera = np.linalg.inv(posterior.T_camera_table)
+    T_table_camera = _view_from_above(posterior, intrinsics)
     sample, slot = np.nonzero(samples.type >= 0)
     weight = np.exp(samples.log_weight[sample] - samples.log_weight.max()) if len(sample) else np.zeros(0)
     if len(sample) > MOST_POINTS:
@@ -121,39 +147,31 @@ def _samples_panel(
             axis.scatter(seen[:, 0], seen[:, 1], s=3, color=colour(label), alpha=0.12, linewidths=0)
             centres = np.concatenate([centres, seen[np.isfinite(seen).all(1), :2]])  # keeps them in view
     owner = np.full(len(sample), -1)
-    for k, found in enumerate(posterior.objects):
-        distance = np.linalg.norm(samples.position[sample, slot] - found.position, axis=1)
-        reach = np.maximum(0.03, 4 * np.sqrt(np.trace(found.covariance[:3, :3])))
-        owner[(kind == posterior.types.index(found.type)) & (distance < reach)] = k
+    if posterior.object_index is not None:
+        for k, found in enumerate(posterior.objects):
+            owner[(posterior.object_index[sample, slot] == k) & (kind == posterior.types.index(found.type))] = k
     for k in range(-1, len(posterior.objects)):
         own = owner == k
         if own.any():
             alpha = np.clip(weight[own] / weight[own].max(), 0.08, 1.0) if k >= 0 else np.clip(weight[own], 0.08, 1.0)
             tone, marker = (colour(k + 1), "o") if k >= 0 else (OTHER, "x")
-            axis.scatter(
-                place[own, 0],
-                place[own, 1],
-                s=9 if k >= 0 else 22,
-                color=tone,
-                alpha=alpha,
-                marker=marker,
-                linewidths=0.8,
-            )
+            size = 9 if k >= 0 else 22
+            axis.scatter(place[own, 0], place[own, 1], s=size, c=tone, marker=marker, alpha=alpha, linewidths=0.8)
     for k in range(len(posterior.objects)):
         _number(axis, centres[k, 0], centres[k, 1], k + 1, offset=(13, 13))
 
-    around = np.concatenate([centres, place[weight > 0.05]]) if len(place) else centres
-    around = around[np.isfinite(around).all(1)] if len(around) else np.zeros((1, 2))
+    # The listed objects fill the view: samples of the prior may lie anywhere on the table.
+    around = centres if len(centres) else place
     around = around if len(around) else np.zeros((1, 2))
     middle = (around.min(0) + around.max(0)) / 2
-    half = max(float((around.max(0) - around.min(0)).max()) / 2 * 1.15, 0.08)
+    half = max(float((around.max(0) - around.min(0)).max()) / 2 * 1.25, 0.1)
     axis.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]), aspect="equal")
     axis.grid(color="#e6e6e6", linewidth=0.7)
     axis.set_axisbelow(True)
     axis.tick_params(labelsize=8, colors=INK)
     axis.set_xlabel("x on the table, m", fontsize=9, color=INK)
     axis.set_ylabel("y on the table, m", fontsize=9, color=INK)
-    axis.set_title("posterior samples from above (dot: an object's origin, x: not listed)", fontsize=10, color=INK)
+    axis.set_title("posterior samples from above (dot: object origin, x: not listed)", fontsize=10, color=INK)
 
 
 def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:

@@ -126,7 +126,8 @@ _ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])
 
 
 def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    """Ten digits: more would only say how sums were ordered."""
+    return float(f"{value:.10g}") if np.isfinite(value) else None
 
 
 def _numbers(values: Any) -> list[Any]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from bayes3d_ros.evaluation.plots import COLOURS, colour, plot_scene
+from bayes3d_ros.evaluation.plots import COLOURS, _view_from_above, colour, plot_scene
 
 TYPES = ("bowl", "can", "mug")
 
@@ -43,3 +43,18 @@ def test_depth_without_a_single_return_and_empty_masks(tmp_path, depth_frame, fa
 
 def test_colours_are_told_apart():
     assert len(set(COLOURS)) == len(COLOURS) and colour(1) == colour(1 + len(COLOURS))
+
+
+def test_a_table_that_is_not_known_is_read_from_the_reconstruction(tmp_path, depth_frame, fake_posterior):
+    """As in a posterior that was received over ROS: the view must be the same up to a shift along the table."""
+    frame = depth_frame()
+    rays, up = frame.intrinsics.rays(), np.array([0, -0.8, -0.6])
+    plane = (-0.5 / (rays @ up)).astype(np.float32)  # half a metre below the camera
+    posterior = replace(fake_posterior(frame, TYPES), reconstruction=plane, T_camera_table=np.full((4, 4), np.nan))
+    T_table_camera = _view_from_above(posterior, frame.intrinsics)
+    np.testing.assert_allclose(T_table_camera[2, :3], up, atol=1e-5)
+    np.testing.assert_allclose((rays * plane[..., None]) @ up + T_table_camera[2, 3], 0, atol=1e-5)
+    np.testing.assert_allclose(T_table_camera[:3, :3] @ T_table_camera[:3, :3].T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(T_table_camera) > 0
+    for known in (frame.intrinsics, None):
+        plot_scene(frame.depth, posterior, tmp_path / "a.png", intrinsics=known)

@@ -43,8 +43,8 @@ def test_a_line_a_frame(written):
         assert len(line["objects"]) == len(posterior.objects)
         for entry, found in zip(line["objects"], posterior.objects, strict=True):
             assert list(entry) == OBJECT_KEYS
-            np.testing.assert_array_equal(entry["covariance"], found.covariance)
-            np.testing.assert_array_equal(entry["position"], found.position)
+            np.testing.assert_allclose(entry["covariance"], found.covariance, rtol=1e-9)
+            np.testing.assert_allclose(entry["position"], found.position, rtol=1e-9)
 
 
 def test_samples_are_the_posterior_rows_of_all_frames(written):
