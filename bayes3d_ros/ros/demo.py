@@ -149,14 +149,15 @@ def _wait(
 ) -> None:
     """Spin until every output of a stamp has come."""
     deadline = time.monotonic() + START_SECONDS
-    said_at, started = time.monotonic(), False
+    said_at, said, started = 0.0, "", False
     while missing := outputs.missing(stamp_ns):
         executor.spin_once(timeout_sec=0.1)
         now = time.monotonic()
         if not started and outputs.by_stamp:
             started, deadline = True, now + PARSE_SECONDS
-        if now - said_at > 5:
-            said_at = now
+        kind = outputs.diagnosis.rstrip("0123456789 sofar")  # without the seconds that it counts
+        if kind != said or now - said_at > 30:
+            said_at, said = now, kind
             say(f"  scene_parser: {outputs.diagnosis or 'starting'}")
         if processes["scene_parser"].status is not None or processes["bag_player"].status not in (None, 0):
             ended = next(n for n, p in processes.items() if p.status is not None)
