@@ -39,8 +39,13 @@ class _OneLineErrors(click.Group):
         except OSError as error:
             raise click.ClickException(f"{error.filename or 'input or output'}: {error.strerror or error}") from error
         except Exception as error:
+            from bayes3d_ros.model.posterior import ParseError
+
+            line = " ".join(str(error).split())
+            if isinstance(error, ParseError):
+                raise click.ClickException(line) from error
             if isinstance(error, _input_errors()):
-                raise InputError(" ".join(str(error).split())) from error
+                raise InputError(line) from error
             raise
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+import bayes3d_ros
 from bayes3d_ros.bags import read_frames
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.inference.scene_parsing import SceneParser
@@ -157,15 +158,8 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """What was measured with."""
-    packages = ("bayes3d_ros", "jax", "jaxlib", "numpy")
-    return {"python": platform.python_version()} | {name: _version(name) for name in packages}
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
+    packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "numpy")}
+    return {"python": platform.python_version(), "bayes3d_ros": bayes3d_ros.__version__} | packages
 
 
 def _lines(path: str) -> list[str]:
