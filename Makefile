@@ -35,7 +35,7 @@ $(STAMP): setup.py pyproject.toml setup.cfg Makefile tools/find_python.sh
 	echo "setup: making $(VENV) with $$python and installing [$$extras]; a few minutes the first time"; \
 	"$$python" -m venv --clear $$options $(VENV); \
 	touch $(VENV)/COLCON_IGNORE; \
-	$(BIN)/python -m pip install --quiet --editable ".[$$extras]"; \
+	$(BIN)/python -m pip install -qq --editable ".[$$extras]"; \
 	touch $(STAMP); echo "setup: done; the command is $(BIN)/bayes3d"
 
 demo: setup

@@ -4,12 +4,9 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
-import jax
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -20,18 +17,17 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ParseError, ScenePosterior
+from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, why_no_input
-from bayes3d_ros.ros.markers import SceneMarkers
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
     SettingsParameters,
 )
+from bayes3d_ros.ros.prepared import MakeParser, Prepared, prepare
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
@@ -39,35 +35,17 @@ from bayes3d_ros.ros.worker import NewestWorker
 _PARSER_PARAMETERS = tuple(f.name for f in fields(ParserSettings))
 
 
-class Parser(Protocol):
-    """What the node needs of a parser."""
-
-    library: Library
-    settings: ParserSettings
-
-    def warm_up(self, width: int, height: int) -> None: ...
-
-    def parse(self, frame: DepthFrame) -> ScenePosterior: ...
-
-
-class Ready(NamedTuple):
-    """A compiled parser and what goes with its library."""
-
-    parser: Parser
-    markers: SceneMarkers
-
-
 class SceneParserNode(Node):
     """Lifecycle: configure loads the library and compiles, activate subscribes. With `autostart` it does both itself,
     compiling on the worker's thread so that it can say meanwhile what it is doing.
     """
 
-    def __init__(self, make_parser: Callable[[Library, ParserSettings], Parser] = SceneParser) -> None:
+    def __init__(self, make_parser: MakeParser = SceneParser) -> None:
         super().__init__("scene_parser")
         self._make_parser = make_parser
         self._health = Health()
         self._settings = SettingsParameters(self, SCENE_PARSER_SETTINGS)
-        self._ready: Ready | None = None  # replaced as a whole; the worker reads it once a frame
+        self._ready: Prepared | None = None  # replaced as a whole; the worker reads it once a frame
         self._inputs: DepthInputs | None = None
         self._preparing_since: float | None = None
         self._requests = 0
@@ -92,7 +70,7 @@ class SceneParserNode(Node):
         """Load the library and compile, unless that has been done already."""
         try:
             if self._ready is None:
-                self._ready = self._build(*self._load())
+                self._ready = prepare(self._make_parser, *self._load(), self._size())
         except (ValueError, LibraryError) as error:
             self._refuse(str(error))
             return TransitionCallbackReturn.FAILURE
@@ -110,7 +88,7 @@ class SceneParserNode(Node):
         self._open_inputs()
         self._outputs.library(self._ready.parser.library)
         types = len(self._ready.parser.library.models)
-        self.get_logger().info(f"active, {types} object types, inference on {self._health.backend or 'unknown'}")
+        self.get_logger().info(f"active, {types} object types, inference on {self._ready.backend}")
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -122,6 +100,7 @@ class SceneParserNode(Node):
         """Forget the parser."""
         self._ready = None
         self._requests += 1  # a parser on its way is not wanted any more
+        self._preparing_since = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -143,19 +122,14 @@ class SceneParserNode(Node):
             raise ValueError("parameter library is not set: expected a folder of object models (bayes3d import)")
         return load_library(Path(node_settings.library).expanduser()), settings
 
-    def _build(self, library: Library, settings: ParserSettings) -> Ready:
-        """Compile; takes seconds to minutes."""
-        parser = self._make_parser(library, settings)
-        size = [int(self.get_parameter(f"warm_up_{side}").value) for side in ("width", "height")]
-        if all(size):
-            parser.warm_up(*size)
-        self._health.backend = jax.default_backend()
-        return Ready(parser, SceneMarkers(library))
+    def _size(self) -> tuple[int, int]:
+        settings = self._settings.read(SceneParserNodeSettings)
+        return settings.warm_up_width, settings.warm_up_height
 
     def _prepare(self) -> str:
         """Have the worker build a parser from the parameters as they are now; what is wrong, or empty."""
         try:
-            library, settings = self._load()
+            (library, settings), size = self._load(), self._size()
         except (ValueError, LibraryError) as error:
             if self._ready is None:
                 self._refuse(str(error))
@@ -170,7 +144,9 @@ class SceneParserNode(Node):
             if request != self._requests:
                 return  # a later request is on its way
             try:
-                self._ready = self._build(library, settings)
+                prepared = prepare(self._make_parser, library, settings, size)
+                if request == self._requests:
+                    self._ready = prepared
             except Exception as error:
                 self._refusal = f"cannot compile the parser: {_one_line(error)}"
                 self.get_logger().debug(traceback.format_exc())
@@ -285,6 +261,8 @@ class SceneParserNode(Node):
     def _report(self) -> None:
         inputs = self._inputs
         level, message = self._why()
+        if self._ready is not None:
+            self._health.backend = self._ready.backend
         report = self._health.report(
             f"{self.get_fully_qualified_name()}: scene parsing",
             level,

@@ -1,0 +1,42 @@
+"""A compiled parser, with what a node needs beside it."""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import jax
+
+from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.ros.markers import SceneMarkers
+
+
+class Parser(Protocol):
+    """What a node needs of a parser; see inference/scene_parsing.py."""
+
+    library: Library
+    settings: ParserSettings
+
+    def warm_up(self, width: int, height: int) -> None: ...
+
+    def parse(self, frame: DepthFrame) -> ScenePosterior: ...
+
+
+MakeParser = Callable[[Library, ParserSettings], Parser]
+
+
+class Prepared(NamedTuple):
+    """A compiled parser, markers for its library, and the name of JAX's backend."""
+
+    parser: Parser
+    markers: SceneMarkers
+    backend: str
+
+
+def prepare(make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int]) -> Prepared:
+    """Compile for images of a size (width, height; none if one is 0). Takes seconds to minutes."""
+    parser = make_parser(library, settings)
+    if all(size):
+        parser.warm_up(*size)
+    return Prepared(parser, SceneMarkers(library), jax.default_backend())
