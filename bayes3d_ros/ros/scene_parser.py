@@ -1,5 +1,6 @@
 """The scene_parser node: depth images in, posteriors over scenes out."""
 
+import contextlib
 import os
 import sys
 import time
@@ -14,6 +15,7 @@ from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from bayes3d_ros.inference.compilation import enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
@@ -295,6 +297,8 @@ def _one_line(error: Exception) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
+    with contextlib.suppress(OSError):  # a home that cannot be written to costs a compilation, not the node
+        enable_cache()
     return run(SceneParserNode, args)
 
 
