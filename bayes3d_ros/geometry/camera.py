@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,36 @@ def resize_depth(
     depth: Float[np.ndarray, "height width"], width: int, height: int
 ) -> Float[np.ndarray, "new_height new_width"]:
     """Nearest-neighbour resize: a minimum or a mean would bias depth, and no value is invented at edges."""
-    v = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
-    u = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(int)
+    v, u = _nearest(depth.shape, width, height)
     return depth[v[:, None], u]
+
+
+def _nearest(shape: tuple[int, int], width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the source pixels."""
+    return (
+        ((np.arange(height) + 0.5) * shape[0] / height).astype(int),
+        ((np.arange(width) + 0.5) * shape[1] / width).astype(int),
+    )
+
+
+def trustworthy(
+    depth: Float[np.ndarray, "height width"], width: int, height: int, reach: int = 2, spread: float = 0.03
+) -> Bool[np.ndarray, "new_height new_width"]:
+    """Which pixels of `resize_depth` stand among returns that agree with them.
+
+    Depth cameras invent values along the edges of things (mixed pixels) and of holes. A pixel is kept if four fifths of
+    its neighbours within `reach` pixels of the full image returned, none of them more than `spread` (a share of the
+    depth) nearer or farther.
+    """
+    v, u = _nearest(depth.shape, width, height)
+    here = depth[v[:, None], u]
+    returns, agree = np.zeros(here.shape, int), np.ones(here.shape, bool)
+    steps = range(-reach, reach + 1)
+    for dv in steps:
+        for du in steps:
+            there = depth[np.clip(v + dv, 0, depth.shape[0] - 1)[:, None], np.clip(u + du, 0, depth.shape[1] - 1)]
+            seen = there > 0
+            returns += seen
+            with np.errstate(invalid="ignore"):
+                agree &= ~(seen & (np.abs(there - here) > spread * here))
+    return agree & (returns >= 0.8 * len(steps) ** 2) & (here > 0)

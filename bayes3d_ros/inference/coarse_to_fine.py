@@ -105,7 +105,7 @@ def candidates(
     coarse = jnp.concatenate([best, per_face.max(1)])
     contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
     contact, _ = align(contact, evidence, image, library, table)
-    score = sketch_score(contact, evidence, image, library, table, 0.008, SKETCH_POINTS)
+    score = sketch_score(contact, evidence, image, library, table, 0.01, 0.5, SKETCH_POINTS)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(contact, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(contact, others, scene.count, library, overlap_limit)

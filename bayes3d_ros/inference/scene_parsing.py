@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, unproject
+from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, unproject
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
@@ -107,6 +107,7 @@ class SceneParser:
                 f"the depth image has no return between {settings.near} and {settings.far} m "
                 f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
             )
+        returned &= trustworthy(frame.depth, width, height)
         points = unproject(np.where(returned, depth, np.nan), camera)
         T_camera_table, notes = self._find_table(frame, points[returned])
         inside = returned & workspace(points, T_camera_table, self._table_size, settings.workspace_height)
@@ -232,8 +233,7 @@ class SceneParser:
             T = np.eye(4, dtype=np.float32)
             T[:3, :3] = Rotation.from_quat(samples.orientation[summary.reference, slot]).as_matrix()
             T[:3, 3] = samples.position[summary.reference, slot]
-            drawn = np.asarray(self._cast(self._arrays, jnp.array([kind]), jnp.asarray(T[None]), rays.reshape(1, -1, 3)))
-            drawn = drawn.reshape(depth.shape)
+            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T), (rays[..., 0], rays[..., 1])))
             nearer = drawn < depth
             depth, labels = np.where(nearer, drawn, depth), np.where(nearer, np.uint16(label), labels)
         return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels

@@ -29,7 +29,7 @@ class ParserSettings:
 
     max_objects: int = setting(8, "most objects a scene may hold", low=0, high=32)
     fixed_objects: int = setting(-1, "parse exactly this many objects; -1 infers the number", low=-1, high=32)
-    count_ratio: float = setting(0.5, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
+    count_ratio: float = setting(0.1, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
     table: str = setting("auto", "where the table's plane comes from", choices=("auto", "pose", "depth"))
     table_width: float = setting(1.2, "width of the table's prior area, along x of the table frame", unit="m", low=0.1)
     table_depth: float = setting(1.2, "depth of the table's prior area, along y of the table frame", unit="m", low=0.1)
@@ -37,7 +37,7 @@ class ParserSettings:
     near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01)
     far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1)
     score_width: int = setting(160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280)
-    window: int = setting(5, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
+    window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
     sigma_max: float = setting(0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4)
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(128, "scenes carried by the sampler", low=1, high=100000)

@@ -21,6 +21,8 @@ YAWS = 24
 MAX_CELLS = 512
 _BLOCK = 4  # cells a step
 _COARSE_POINTS = 48
+# Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
+_COARSE_TOLERANCE, _COARSE_PENALTY = 0.02, 0.25
 _REACH = 3  # cells: how far from unexplained returns an object's centre is looked for
 _NATS = 8.0  # what a pixel explained is worth, roughly
 
@@ -39,16 +41,18 @@ def sketch_score(
     library: LibraryArrays,
     table: Table,
     tolerance: float,
+    penalty: float,
     points: int,
 ) -> Float[Array, "N"]:
-    """Rough gain in nats of adding an object; `tolerance` in metres of depth, `points` of the sketch are used."""
+    """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
+    past, relative to the reward of one that matches; the first `points` of the sketch are used."""
     T = T_camera_object(contact, library, table)
     z, gap, weight = _compare(T, contact.type, evidence, image, library, points)
     matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * weight
     through = jnp.where(gap > tolerance, jnp.minimum(gap / tolerance - 1, 1.0), 0.0)
     # Half of the surface faces the camera; its pixels, at half obliqueness.
     pixels = library.sketch_area[contact.type] * library.sketch.shape[1] / points * image.focal[0] * image.focal[1]
-    return _NATS * 0.5 * pixels * ((matched - through) / z**2).sum(-1)
+    return _NATS * 0.5 * pixels * ((matched - penalty * through) / z**2).sum(-1)
 
 
 def _compare(T, type_index, evidence, image, library, points):
@@ -108,7 +112,6 @@ def score_cells(
     image: Image,
     library: LibraryArrays,
     table: Table,
-    tolerance: float = 0.015,
 ) -> Float[Array, "C K 6 Y"]:
     """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
     kinds = library.first.shape[0]
@@ -126,7 +129,7 @@ def score_cells(
             y=jnp.repeat(xy[:, 1], per_cell),
             yaw=jnp.tile((yaw + 0.5) * (2 * jnp.pi / YAWS), _BLOCK),
         )
-        value = sketch_score(contact, evidence, image, library, table, tolerance, _COARSE_POINTS)
+        value = sketch_score(contact, evidence, image, library, table, _COARSE_TOLERANCE, _COARSE_PENALTY, _COARSE_POINTS)
         value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
         return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
 

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
@@ -12,6 +12,8 @@ from bayes3d_ros.model.posterior import ParseError
 _INLIER = 0.008  # metres at 1 m, growing with depth squared beyond
 _TRIALS = 400
 _CELL = 0.02  # metres, of the map of the table's support
+_MARGIN = 0.0  # metres, about the hull
+_STANDS = 0.6  # the share of a piece that must be over the table
 _BELOW = 0.02  # metres below the plane that still count as the table
 
 
@@ -104,26 +106,53 @@ def workspace(
     T_camera_table: Float[np.ndarray, "4 4"],
     table_size: tuple[float, float],
     height: float,
-    margin: float = 0.05,
 ) -> Bool[np.ndarray, "H W"]:
-    """Which returns stand on or above what is seen of the table: above the convex hull of the table's surface, grown by
-    `margin` metres, and inside the prior area grown likewise. NaN points are not."""
+    """Which returns belong to the table or to things that stand on it; NaN points do not.
+
+    Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from the
+    plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what is seen
+    of the table's surface. (A chair behind the table touches its edge in the image, and a part of it may lean over.)
+    Raises ParseError where nothing of the table is seen.
+    """
     local = (points - T_camera_table[:3, 3]) @ T_camera_table[:3, :3]
     z_camera = points[..., 2]
     with np.errstate(invalid="ignore"):
-        tall = (local[..., 2] > -_BELOW * np.maximum(1, z_camera**2)) & (local[..., 2] < height)
-        tall &= (np.abs(local[..., 0]) < table_size[0] / 2 + margin) & (np.abs(local[..., 1]) < table_size[1] / 2 + margin)
-        surface = local[tall & (np.abs(local[..., 2]) < _tolerance(z_camera))][:, :2]
-    hull = _support(surface, margin)
+        candidate = (local[..., 2] > -_BELOW * np.maximum(1, z_camera**2)) & (local[..., 2] < height)
+        candidate &= (np.abs(local[..., :2]) < np.array(table_size) / 2).all(-1)
+        flat = candidate & (np.abs(local[..., 2]) < _tolerance(z_camera))
+    # The foot of a wall or of an object lies in the plane too: keep what is flat all around.
+    surface = local[ndimage.binary_erosion(flat | np.isnan(z_camera), iterations=2, border_value=1) & flat][:, :2]
+    eye = -T_camera_table[:3, :3].T @ T_camera_table[:3, 3]
+    hull = _support(surface, eye[:2])
     if hull is None:
         raise ParseError("no table in sight: nothing is seen of its surface inside the table's area")
-    inside = np.zeros(tall.shape, bool)
-    inside[tall] = hull.find_simplex(local[tall][:, :2]) >= 0
-    return inside
+    over = np.zeros(candidate.shape, bool)
+    over[candidate] = hull.find_simplex(local[candidate][:, :2]) >= 0
+    pieces, count = _pieces(candidate & ~flat, z_camera)
+    share = ndimage.mean(over, pieces, np.arange(count + 1)) if count else np.zeros(1)
+    return (flat & over) | ((pieces > 0) & (share > _STANDS)[pieces])
 
 
-def _support(surface: Float[np.ndarray, "N 2"], margin: float) -> Delaunay | None:
-    """The convex hull of the largest connected piece of surface, grown by `margin`."""
+def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:
+    """Pieces of an image connected without a jump in depth."""
+    # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
+    with np.errstate(invalid="ignore"):
+        cut = np.zeros(risen.shape, bool)
+        for axis in (0, 1):
+            step = np.diff(depth, axis=axis)
+            jump = np.abs(step) > 0.03 * np.take(depth, range(1, depth.shape[axis]), axis)
+            later = np.zeros(risen.shape, bool)
+            later[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] = jump
+            cut |= later
+    pieces, count = ndimage.label(risen & ~cut)
+    # Pixels on the cuts join the nearest piece.
+    nearest = ndimage.distance_transform_edt(pieces == 0, return_distances=False, return_indices=True)
+    return np.where(risen, pieces[tuple(nearest)], 0) if count else pieces, count
+
+
+def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> Delaunay | None:
+    """The convex hull of the largest connected piece of surface, grown by a margin, and reaching to below the camera: the
+    lower edge of the image is not the edge of the table."""
     if len(surface) < 50:
         return None
     low = surface.min(0)
@@ -137,9 +166,9 @@ def _support(surface: Float[np.ndarray, "N 2"], margin: float) -> Delaunay | Non
     sizes = ndimage.sum_labels(counts > 1, labels, np.arange(1, found + 1))
     piece = labels[tuple(index.T + 1)] == 1 + int(np.argmax(sizes))
     piece &= counts[tuple(index.T + 1)] > 1
-    ring = margin * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
+    ring = _MARGIN * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
     try:
         corners = surface[piece][ConvexHull(surface[piece]).vertices]
-        return Delaunay((corners[:, None] + ring).reshape(-1, 2))
+        return Delaunay(np.concatenate([(corners[:, None] + ring).reshape(-1, 2), eye[None]]))
     except (QhullError, ValueError):
         return None

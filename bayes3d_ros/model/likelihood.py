@@ -11,10 +11,13 @@ depth image and integrates to one over z for every scene. Where the window holds
 
 A return beyond the workspace (floor, wall, robot) is free-space evidence: where the scene puts a surface in front of it, it
 is an outlier, p_out a(z); elsewhere it has the scene-independent density a(z).
+
+Arrays are [rows, columns, tiles]: tiles come last, so that every operation runs along them.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -23,19 +26,19 @@ _FAR_AWAY = 1e6  # stands for an infinite squared distance
 
 
 class Noise(NamedTuple):
-    """sigma in metres, p_outlier; arrays of one shape."""
+    """sigma in metres, p_outlier; arrays of one shape, or the two axes of a grid."""
 
-    sigma: Float[Array, "*batch"]
-    p_outlier: Float[Array, "*batch"]
+    sigma: Float[Array, "S"]
+    p_outlier: Float[Array, "P"]
 
 
 class Pixels(NamedTuple):
-    """Observed pixels, any shape, with their geometry: rays (x, y, 1), and the ray's change per pixel."""
+    """Observed pixels with their geometry: rays (x, y, 1), and the ray's change per pixel."""
 
-    depth: Float[Array, "*shape"]  # metres, any finite number where there is no return
-    kind: Int[Array, "*shape"]
-    ray_x: Float[Array, "*shape"]
-    ray_y: Float[Array, "*shape"]
+    depth: Float[Array, "h w T"]  # metres, any finite number where there is no return
+    kind: Int[Array, "h w T"]
+    ray_x: Float[Array, "h w T"]
+    ray_y: Float[Array, "h w T"]
     step_x: Float[Array, ""]
     step_y: Float[Array, ""]
     outlier_scale: Float[Array, ""]  # 3 / (far^3 - near^3)
@@ -43,17 +46,17 @@ class Pixels(NamedTuple):
 
 
 def inlier_density(
-    rendered: Float[Array, "T hr wr"], pixels: Pixels, sigma: Float[Array, "S"], window: int
-) -> Float[Array, "S T h w"]:
+    rendered: Float[Array, "hr wr T"], pixels: Pixels, sigma: Float[Array, "S"], window: int
+) -> Float[Array, "S h w T"]:
     """The mixture over the window for every sigma, per metre; `rendered` has a border of window // 2 pixels around."""
     half = window // 2
-    height, width = pixels.depth.shape[-2:]
+    height, width = pixels.depth.shape[:2]
     a, b = pixels.ray_x, pixels.ray_y
     norm2 = 1 + a * a + b * b
     across, along = [], []  # squared distances from the ray, and along it, of every point in the window
     for dv in range(-half, half + 1):
         for du in range(-half, half + 1):
-            y = rendered[..., half + dv : half + dv + height, half + du : half + du + width]
+            y = rendered[half + dv : half + dv + height, half + du : half + du + width]
             surface = jnp.isfinite(y)
             y = jnp.where(surface, y, 0.0)
             ex, ey = du * pixels.step_x, dv * pixels.step_y
@@ -63,57 +66,50 @@ def inlier_density(
     nearest = across[0]
     for d in across[1:]:
         nearest = jnp.minimum(nearest, d)
-    densities = []
+    density = []
     for s in range(sigma.shape[0]):
         scale = -0.5 / sigma[s] ** 2
-        weighted = total = jnp.zeros_like(norm2)
+        both = weight = jnp.zeros_like(norm2)
         for d, q in zip(across, along, strict=True):
-            weighted += jnp.exp(scale * (d - nearest + q))
-            total += jnp.exp(scale * (d - nearest))
-        densities.append(weighted / total * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma[s]))
-    background = outlier_density(pixels)
-    return jnp.where(nearest < _FAR_AWAY, jnp.stack(densities), background)
+            both += jnp.exp(scale * (d - nearest + q))
+            weight += jnp.exp(scale * (d - nearest))
+        density.append(both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma[s]))
+    return jnp.where(nearest < _FAR_AWAY, jnp.stack(density), outlier_density(pixels))
 
 
-def outlier_density(pixels: Pixels) -> Float[Array, "*shape"]:
+def outlier_density(pixels: Pixels) -> Float[Array, "h w T"]:
     return pixels.outlier_scale * pixels.depth**2
 
 
-def pixel_likelihood(
-    inlier: Float[Array, "S T h w"], nearest: Float[Array, "T h w"], pixels: Pixels, p_outlier: Float[Array, "P"]
-) -> list[list[Float[Array, "T h w"]]]:
-    """likelihood[s][p] of each pixel. `nearest` is the scene's depth at the pixel itself, without what stands for the
-    table at pixels beyond the workspace. One where there is no return."""
-    a = outlier_density(pixels)
-    in_front = nearest < pixels.depth + pixels.front_margin
-    table = []
-    for s in range(inlier.shape[0]):
-        row = []
-        for p in range(p_outlier.shape[0]):
-            seen = p_outlier[p] * a + (1 - p_outlier[p]) * inlier[s]
-            beyond = jnp.where(in_front, p_outlier[p] * a, a)
-            row.append(jnp.where(pixels.kind == IN_WORKSPACE, seen, jnp.where(pixels.kind == BEYOND, beyond, 1.0)))
-        table.append(row)
-    return table
-
-
 def log_likelihood(
-    rendered: Float[Array, "T hr wr"],
-    pixels: Pixels,
-    sigma: Float[Array, "S"],
-    p_outlier: Float[Array, "P"],
-    window: int,
-) -> Float[Array, "T S P"]:
-    """Sum over the pixels of each tile of the log likelihood, for every pair of noise values."""
+    rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
+) -> Float[Array, "S P T"]:
+    """Sum over the pixels of each tile of the log likelihood, for every pair of noise values. Their number is a
+    multiple of four; `rendered` has a border of window // 2 pixels around."""
     half = window // 2
-    height, width = pixels.depth.shape[-2:]
-    nearest = rendered[..., half : half + height, half : half + width]
-    inlier = inlier_density(rendered, pixels, sigma, window)
-    table = pixel_likelihood(inlier, nearest, pixels, p_outlier)
-    return jnp.stack([jnp.stack([_sum_log(v) for v in row], -1) for row in table], -2)
+    height, width = pixels.depth.shape[:2]
+    a = outlier_density(pixels)
+    # Whatever the pixel's kind, its likelihood is p_out outlier + (1 - p_out) inlier.
+    in_front = rendered[half : half + height, half : half + width] < pixels.depth + pixels.front_margin
+    beyond = jnp.where(in_front, 0.0, a)
+    inlier = inlier_density(rendered, pixels, noise.sigma, window)
+    inlier = jnp.where(pixels.kind == IN_WORKSPACE, inlier, jnp.where(pixels.kind == BEYOND, beyond, 1.0))
+    outlier = jnp.where(pixels.kind == NO_RETURN, 1.0, a)
+    tiles = outlier.shape[-1]
+    return _sum_log(outlier.reshape(-1, tiles), inlier.reshape(inlier.shape[0], -1, tiles), noise.p_outlier)
 
 
-def _sum_log(values: Float[Array, "T h w"]) -> Float[Array, "T"]:
-    """Sum of logs through the logs of products of four; a pixel's likelihood stays within 1e-9 .. 1e5."""
-    rows = jnp.maximum(values, 1e-9).reshape(values.shape[0], -1, 4)
-    return jnp.log(rows[..., 0] * rows[..., 1] * rows[..., 2] * rows[..., 3]).sum(-1)
+def _sum_log(
+    outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"]
+) -> Float[Array, "S P T"]:
+    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels: each lies in 1e-8 .. 1e5."""
+    p = p[None, :, None]
+
+    def four(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
+        product = 1.0
+        for m in range(4):
+            product *= p * outlier[4 * k + m] + (1 - p) * inlier[:, None, 4 * k + m]
+        return total + jnp.log(product)
+
+    start = jnp.zeros((inlier.shape[0], p.shape[1], outlier.shape[1]))
+    return jax.lax.fori_loop(0, outlier.shape[0] // 4, four, start)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
+from bayes3d_ros.model.likelihood import NO_RETURN, Noise, Pixels, log_likelihood
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
 
@@ -86,18 +86,11 @@ def _over_tiles(work, carry, contact, image, library, table, half):
         within = jnp.where(real, index - tiles.first[n], 0)
         u = tiles.u[n] + within % tiles.columns[n] * TILE
         v = tiles.v[n] + within // tiles.columns[n] * TILE
-        x = (u[:, None] + offset - image.centre[0]) / image.focal[0]
-        y = (v[:, None] + offset - image.centre[1]) / image.focal[1]
         side = TILE + 2 * half
-        rays = jnp.stack(
-            [
-                jnp.broadcast_to(x[:, None, :], (CHUNK, side, side)),
-                jnp.broadcast_to(y[:, :, None], (CHUNK, side, side)),
-                jnp.ones((CHUNK, side, side)),
-            ],
-            -1,
-        )
-        depth = render(library, contact.type[n], T[n], rays.reshape(CHUNK, -1, 3)).reshape(CHUNK, side, side)
+        shape = (side, side, CHUNK)
+        x = jnp.broadcast_to((u + offset[:, None] - image.centre[0]) / image.focal[0], shape)
+        y = jnp.broadcast_to(((v + offset[:, None] - image.centre[1]) / image.focal[1])[:, None], shape)
+        depth = render(library, contact.type[n], T[n], (x, y))
         return start + CHUNK, work(carry, n, u, v, depth, real)
 
     return jax.lax.while_loop(lambda state: state[0] < total, chunk, (jnp.int32(0), carry))[1]
@@ -105,23 +98,22 @@ def _over_tiles(work, carry, contact, image, library, table, half):
 
 def _crop(scenes, index, u, v, side):
     """Square crops of padded scenes; (u, v) are pixels of the unpadded image, the crop starts half a window before."""
-    rows = v[:, None] + jnp.arange(side)
-    columns = u[:, None] + jnp.arange(side)
-    return scenes[index[:, None, None], rows[:, :, None], columns[:, None, :]]
+    step = jnp.arange(side)[:, None]
+    return scenes[index, (v + step)[:, None], u + step]
 
 
 def _observed(image: Image, u, v) -> Pixels:
     """The observed pixels of tiles; those that stick out of the image have no return."""
     height, width = image.depth.shape
-    rows, columns = v[:, None] + jnp.arange(TILE), u[:, None] + jnp.arange(TILE)
-    inside = (rows < height)[:, :, None] & (columns < width)[:, None, :]
+    step = jnp.arange(TILE)[:, None]
+    rows, columns = (v + step)[:, None], u + step
+    inside = (rows < height) & (columns < width)
     rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
-    shape = inside.shape
     return Pixels(
-        depth=image.depth[rows[:, :, None], columns[:, None, :]],
-        kind=jnp.where(inside, image.kind[rows[:, :, None], columns[:, None, :]], 0),
-        ray_x=jnp.broadcast_to(image.ray_x[columns][:, None, :], shape),
-        ray_y=jnp.broadcast_to(image.ray_y[rows][:, :, None], shape),
+        depth=image.depth[rows, columns],
+        kind=jnp.where(inside, image.kind[rows, columns], NO_RETURN),
+        ray_x=jnp.broadcast_to(image.ray_x[columns], inside.shape),
+        ray_y=jnp.broadcast_to(image.ray_y[rows], inside.shape),
         step_x=1 / image.focal[0],
         step_y=1 / image.focal[1],
         outlier_scale=image.outlier_scale,
@@ -150,9 +142,8 @@ def log_likelihood_gain(
         pixels = _observed(image, u, v)
         before = _crop(scenes, ancestor[n], u, v, side)
         after = jnp.minimum(before, depth)
-        gain = log_likelihood(after, pixels, noise.sigma, noise.p_outlier, window)
-        gain -= log_likelihood(before, pixels, noise.sigma, noise.p_outlier, window)
-        return gains.at[n].add(jnp.where(real[:, None, None], gain, 0.0))
+        gain = log_likelihood(after, pixels, noise, window) - log_likelihood(before, pixels, noise, window)
+        return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
 
     gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
     return _over_tiles(add, gains, contact, image, library, table, half)
@@ -172,12 +163,12 @@ def add_objects(
 
     def draw(state, n, u, v, depth, real):
         scenes, covered = state
-        depth = jnp.where(real[:, None, None], depth[:, half : half + TILE, half : half + TILE], jnp.inf)
-        rows, columns = v[:, None] + jnp.arange(TILE), u[:, None] + jnp.arange(TILE)
-        inside = (rows < height)[:, :, None] & (columns < width)[:, None, :]
-        depth = jnp.where(inside, depth, jnp.inf)
-        scenes = scenes.at[n[:, None, None], half + rows[:, :, None], half + columns[:, None, :]].min(depth)
-        return scenes, covered.at[n].add(jnp.isfinite(depth).sum((1, 2)))
+        step = jnp.arange(TILE)[:, None]
+        rows, columns = (v + step)[:, None], u + step
+        inside = real & (rows < height) & (columns < width)
+        depth = jnp.where(inside, depth[half : half + TILE, half : half + TILE], jnp.inf)
+        scenes = scenes.at[n, half + rows, half + columns].min(depth)
+        return scenes, covered.at[n].add(jnp.isfinite(depth).sum((0, 1)))
 
     return _over_tiles(draw, (scenes, jnp.zeros(contact.type.shape, jnp.int32)), contact, image, library, table, half)
 
@@ -187,24 +178,23 @@ def log_likelihood_scene(
 ) -> Float[Array, "A S P"]:
     """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
     height, width = image.depth.shape
-    before, after = border(window)
-    pad = [(0, -height % 4), (0, -width % 4)]
+    half = window // 2
+    grow = -width % 4  # pixels without a return, to a multiple of four
+    shape = (height, width + grow, 1)
+    pad = [(0, 0), (0, grow)]
     pixels = Pixels(
-        depth=jnp.pad(image.depth, pad)[None],
-        kind=jnp.pad(image.kind, pad)[None],
-        ray_x=jnp.broadcast_to(jnp.pad(image.ray_x, pad[1]), (1, height + pad[0][1], width + pad[1][1])),
-        ray_y=jnp.broadcast_to(jnp.pad(image.ray_y, pad[0])[:, None], (1, height + pad[0][1], width + pad[1][1])),
+        depth=jnp.pad(image.depth, pad)[..., None],
+        kind=jnp.pad(image.kind, pad, constant_values=NO_RETURN)[..., None],
+        ray_x=jnp.broadcast_to(jnp.pad(image.ray_x, pad[1])[:, None], shape),
+        ray_y=jnp.broadcast_to(image.ray_y[:, None, None], shape),
         step_x=1 / image.focal[0],
         step_y=1 / image.focal[1],
         outlier_scale=image.outlier_scale,
         front_margin=image.front_margin,
     )
-    rows, columns = height + pad[0][1] + 2 * before, width + pad[1][1] + 2 * before
-    return jax.lax.map(
-        lambda scene: log_likelihood(
-            scene[None, :rows, :columns], pixels, noise.sigma, noise.p_outlier, window
-        )[0],
-        scenes,
-    )
 
+    def one(scene: Float[Array, "Hp Wp"]) -> Float[Array, "S P"]:
+        rendered = scene[: height + 2 * half, : width + grow + 2 * half, None]
+        return log_likelihood(rendered, pixels, noise, window)[..., 0]
 
+    return jax.lax.map(one, scenes)

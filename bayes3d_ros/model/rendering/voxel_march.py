@@ -4,7 +4,10 @@ What is rendered (the reference renders the same): a surface voxel is hit where 
 meets the voxel's plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
+Most rays end within a few steps and a few graze on for dozens: after the first steps those left are packed together.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,71 +16,115 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.model.library_arrays import OFFSET_RANGE, LibraryArrays
 
 INFLATION = 0.2  # voxels
-MAX_STEPS = 48
+MAX_STEPS = 96
+_FIRST_STEPS, _PACK = 8, 2048
 _NUDGE = 2e-3  # voxels, past a cube's face
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
 
-def _byte(words: Int[Array, "*batch"], shift: int) -> Float[Array, "*batch"]:
-    return jax.lax.shift_right_arithmetic(jax.lax.shift_left(words, 24 - shift), 24).astype(jnp.float32)
+class _Rays(NamedTuple):
+    """Rays in voxel units of the grid that each walks through; every field has one element a ray."""
+
+    first: Int[Array, "N"]
+    dims: tuple[Int[Array, "N"], ...]
+    origin: tuple[Float[Array, "N"], ...]
+    direction: tuple[Float[Array, "N"], ...]
+    leave: Float[Array, "N"]
 
 
 def march(
     library: LibraryArrays,
-    type_index: Int[Array, "N"],
-    T_camera_object: Float[Array, "N 4 4"],
-    rays: Float[Array, "N P 3"],
+    type_index: Int[Array, "*objects"],
+    T_camera_object: Float[Array, "*objects 4 4"],
+    rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
     near: float = 0.05,
-) -> Float[Array, "N P"]:
-    """Depth z in metres of object n along its rays (r_z = 1), NO_SURFACE where it is not met."""
-    size = library.voxel_size[type_index][:, None]
-    rotation = T_camera_object[:, :3, :3]
-    eye = -(rotation * T_camera_object[:, :3, 3][:, :, None]).sum(1) - library.origin[type_index]
-    o = [eye[:, None, a] / size for a in range(3)]
-    d = [sum(rotation[:, b, a][:, None] * rays[..., b] for b in range(3)) / size for a in range(3)]
-    dims = [library.dims[type_index, a][:, None] for a in range(3)]
-    return _march_grid(library.words, library.first[type_index][:, None], dims, o, d, near)
+) -> Float[Array, "*shape"]:
+    """Depth z in metres along rays (x, y, 1) of an object each, NO_SURFACE where it is not met.
 
-
-def _march_grid(words, first, dims, o, d, near):
-    """The walk itself, in voxel units; o and d are the rays' origins and directions by axis."""
-    d = [jnp.where(jnp.abs(x) < 1e-6, 1e-6, x) for x in d]
-    inverse = [1.0 / x for x in d]
-    forward = [jnp.where(x > 0, 1.0, -1.0) for x in d]
-    extent = [n.astype(jnp.float32) for n in dims]
-    low = [-a * i for a, i in zip(o, inverse, strict=True)]
-    high = [(n - a) * i for n, a, i in zip(extent, o, inverse, strict=True)]
+    `objects` broadcasts against `shape` from the right: rays of shape [h, w, N] walk through N objects.
+    """
+    shape = rays[0].shape
+    size = library.voxel_size[type_index]
+    R, t = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]
+    eye = [(-sum(R[..., b, a] * t[..., b] for b in range(3)) - library.origin[type_index, a]) / size for a in range(3)]
+    x, y = rays
+    d = [(R[..., 0, a] * x + R[..., 1, a] * y + R[..., 2, a]) / size for a in range(3)]
+    d = [jnp.where(jnp.abs(c) < 1e-6, 1e-6, c) for c in d]
+    dims = [library.dims[type_index, a] for a in range(3)]
+    low = [-a / c for a, c in zip(eye, d, strict=True)]
+    high = [(n - a) / c for n, a, c in zip(dims, eye, d, strict=True)]
     enter, leave = jnp.minimum(low[0], high[0]), jnp.maximum(low[0], high[0])
     for a in (1, 2):
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
-    nudge = _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
-    start = jnp.maximum(enter, near) + nudge
+    start = jnp.maximum(enter, near) + _nudge(d)
 
-    def unfinished(state):
-        step, t, _ = state
-        return (step < MAX_STEPS) & jnp.any(t < leave)
+    def flat(a: Array) -> Array:
+        return jnp.broadcast_to(a, shape).ravel()
 
-    def advance(state):
-        step, t, hit = state
-        cell = [jnp.clip(jnp.floor(a + t * x), 0.0, n - 1.0) for a, x, n in zip(o, d, extent, strict=True)]
-        i, j, k = (c.astype(jnp.int32) for c in cell)
-        word = words[first + (i * dims[1] + j) * dims[2] + k]
-        surface = (word & -256) != 0
-        half = jnp.where(surface, 0.5, (word & 255).astype(jnp.float32) - 0.5)
-        from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]
-        exits = [(f * half - r) * i for f, r, i in zip(forward, from_centre, inverse, strict=True)]
-        exit_t = jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2])
-        normal = [_byte(word, shift) for shift in (24, 16, 8)]
-        facing = sum(n * x for n, x in zip(normal, d, strict=True))
-        ahead = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
-        meet = ahead / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
-        reach = [jnp.abs(r + meet * x) for r, x in zip(from_centre, d, strict=True)]
-        on_plane = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2]) <= 0.5 + INFLATION
-        met = jnp.where(surface, on_plane & (meet > near), word == 0) & (t < leave)
-        hit = jnp.where(met, jnp.where(surface, meet, t), hit)
-        t = jnp.where(met, jnp.inf, jnp.maximum(exit_t, t) + nudge)
-        return step + 1, t, hit
+    walk = _Rays(
+        flat(library.first[type_index]),
+        tuple(map(flat, dims)),
+        tuple(map(flat, eye)),
+        tuple(map(flat, d)),
+        flat(leave),
+    )
+    t, hit = flat(start), jnp.full(walk.leave.shape, NO_SURFACE)
+    t, hit = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, s: _advance(library.words, walk, *s, near), (t, hit))
+    return _finish(library.words, walk, t, hit, near).reshape(shape)
 
-    _, _, hit = jax.lax.while_loop(unfinished, advance, (0, start, jnp.full(start.shape, NO_SURFACE)))
-    return hit
+
+def _nudge(d: list[Array]) -> Array:
+    return _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
+
+
+def _finish(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> Array:
+    """Walk the rays that are left to their ends, a packed batch at a time."""
+    count = t.shape[0]
+    size = min(_PACK, count)
+
+    def batch(state):
+        t, hit = state
+        index = jnp.nonzero(t < walk.leave, size=size, fill_value=0)[0]
+        some = jax.tree.map(lambda a: a[index], walk)
+
+        def unfinished(inner):
+            step, t, _ = inner
+            return (step < MAX_STEPS) & jnp.any(t < some.leave)
+
+        def go(inner):
+            step, t, hit = inner
+            return step + 1, *_advance(words, some, t, hit, near)
+
+        _, _, packed_hit = jax.lax.while_loop(unfinished, go, (0, t[index], hit[index]))
+        return t.at[index].set(jnp.inf), hit.at[index].set(packed_hit)
+
+    return jax.lax.while_loop(lambda state: jnp.any(state[0] < walk.leave), batch, (t, hit))[1]
+
+
+def _byte(words: Int[Array, "N"], shift: int) -> Float[Array, "N"]:
+    return jax.lax.shift_right_arithmetic(jax.lax.shift_left(words, 24 - shift), 24).astype(jnp.float32)
+
+
+def _advance(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> tuple[Array, Array]:
+    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray that is done has t = inf."""
+    o, d, dims = walk.origin, walk.direction, walk.dims
+    active = t < walk.leave
+    at = jnp.where(active, t, 0.0)
+    cell = [jnp.clip(jnp.floor(a + at * c), 0.0, n - 1.0) for a, c, n in zip(o, d, dims, strict=True)]
+    i, j, k = (c.astype(jnp.int32) for c in cell)
+    word = words[walk.first + (i * dims[1] + j) * dims[2] + k]
+    surface = (word & -256) != 0
+    half = jnp.where(surface, 0.5, (word & 255).astype(jnp.float32) - 0.5)
+    from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]
+    exits = [(jnp.where(c > 0, half, -half) - r) / c for c, r in zip(d, from_centre, strict=True)]
+    normal = [_byte(word, shift) for shift in (24, 16, 8)]
+    facing = sum(n * c for n, c in zip(normal, d, strict=True))
+    ahead = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
+    meet = ahead / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
+    reach = [jnp.abs(r + meet * c) for r, c in zip(from_centre, d, strict=True)]
+    on_plane = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2]) <= 0.5 + INFLATION
+    met = jnp.where(surface, on_plane & (meet > near), word == 0) & active
+    hit = jnp.where(met, jnp.where(surface, meet, t), hit)
+    beyond = jnp.maximum(jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2]), t) + _nudge(d)
+    return jnp.where(met | ~active, jnp.inf, beyond), hit
