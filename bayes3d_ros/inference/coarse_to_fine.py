@@ -163,7 +163,7 @@ def narrow(
             contact.yaw[:, None] + offset[..., 2],
         )
         value = _gains(jax.tree.map(jnp.ravel, draws), scene, context, noise, window).reshape(-1, _DRAWS)
-        weight = _temper(value, 5.0)
+        weight = _temper(jnp.maximum(value, -1e9), 5.0)  # a mode outside the prior must not breed NaN
         mean = jnp.einsum("md,mda->ma", weight, offset)
         centred = offset - mean[:, None]
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)

@@ -16,7 +16,7 @@ from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
 from bayes3d_ros.model.library_arrays import library_arrays
-from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.model.likelihood import BEYOND
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError, SceneSamples, ScenePosterior
@@ -110,8 +110,7 @@ class SceneParser:
         returned &= trustworthy(frame.depth, width, height)
         points = unproject(np.where(returned, depth, np.nan), camera)
         T_camera_table, notes = self._find_table(frame, points[returned])
-        inside = returned & workspace(points, T_camera_table, self._table_size, settings.workspace_height)
-        kind = np.where(inside, IN_WORKSPACE, np.where(returned, BEYOND, NO_RETURN))
+        kind = workspace(points, T_camera_table, self._table_size, settings.workspace_height)
         rays = camera.rays()
         normal = T_camera_table[:3, 2]
         facing = rays @ normal

@@ -7,12 +7,15 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.model.posterior import ParseError
 
 _INLIER = 0.008  # metres at 1 m, growing with depth squared beyond
 _TRIALS = 400
 _CELL = 0.02  # metres, of the map of the table's support
 _MARGIN = 0.0  # metres, about the hull
+_SMALLEST = 8  # pixels of a piece that counts as standing on the table
+_EDGE = 3  # pixels
 _STANDS = 0.6  # the share of a piece that must be over the table
 _BELOW = 0.02  # metres below the plane that still count as the table
 
@@ -106,8 +109,9 @@ def workspace(
     T_camera_table: Float[np.ndarray, "4 4"],
     table_size: tuple[float, float],
     height: float,
-) -> Bool[np.ndarray, "H W"]:
-    """Which returns belong to the table or to things that stand on it; NaN points do not.
+) -> Int[np.ndarray, "H W"]:
+    """The kind of every pixel: IN_WORKSPACE if its return belongs to the table or to something that stands on it, BEYOND
+    if to something else, NO_RETURN where the point is NaN or, along the table's edge, where one cannot tell.
 
     Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from the
     plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what is seen
@@ -129,8 +133,15 @@ def workspace(
     over = np.zeros(candidate.shape, bool)
     over[candidate] = hull.find_simplex(local[candidate][:, :2]) >= 0
     pieces, count = _pieces(candidate & ~flat, z_camera)
-    share = ndimage.mean(over, pieces, np.arange(count + 1)) if count else np.zeros(1)
-    return (flat & over) | ((pieces > 0) & (share > _STANDS)[pieces])
+    stands = np.zeros(candidate.shape, bool)
+    if count:
+        share = ndimage.mean(over, pieces, np.arange(count + 1))
+        size = np.bincount(pieces.ravel(), minlength=count + 1)
+        stands = (pieces > 0) & ((share > _STANDS) & (size >= _SMALLEST))[pieces]
+    # The foot of what stands beyond the table's edge is as flat as the table.
+    other = np.isfinite(z_camera) & ~stands & ~(flat & over)
+    table = flat & over & ~ndimage.binary_dilation(other, iterations=_EDGE)
+    return np.where(stands | table, IN_WORKSPACE, np.where(other, BEYOND, NO_RETURN))
 
 
 def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:

@@ -20,12 +20,14 @@ from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from bayes3d_ros.bags import read_frames
+from bayes3d_ros.evaluation.metrics import add_s
 from bayes3d_ros.evaluation.plots import plot_scene
 from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.model.objects import Library, load_library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ScenePosterior
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.conversions import matrix_from_values
 from bayes3d_ros.ros.detections import detections_type
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
@@ -119,7 +121,7 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
             raise DemoError(f"{name} ended with status {status}; see {processes[name].log}")
     messages = outputs.by_stamp[frame.stamp_ns]
     posterior = posterior_from_messages(messages, library)
-    for line in scene_table(posterior, truth(bag, frame)):
+    for line in scene_table(posterior, errors(posterior, library, truth(bag, frame))):
         say(line)
     picture = plot_scene(frame.depth, posterior, out / "scene.png", f"{bag.name}, as published", frame.intrinsics)
     say(f"every output arrived; picture: {picture}")
@@ -167,25 +169,34 @@ def _wait(
 
 
 def truth(bag: Path, frame: DepthFrame) -> dict[str, np.ndarray]:
-    """True positions of the objects of a simulated frame, in the camera frame, by name."""
+    """True T_camera_object of the objects of a simulated frame, by name."""
     frames = json.loads((bag / "ground_truth.json").read_text())["frames"]
     (mine,) = [f for f in frames if f["stamp_ns"] == frame.stamp_ns]
-    return {o["name"]: np.array(o["T_camera_object"])[:3, 3] for o in mine["objects"]}
+    return {o["name"]: np.array(o["T_camera_object"]) for o in mine["objects"]}
 
 
-def scene_table(posterior: ScenePosterior, true_positions: dict[str, np.ndarray]) -> list[str]:
-    """A line per object: type, probabilities, pose, standard deviations, distance from the true position."""
+def errors(posterior: ScenePosterior, library: Library, true_poses: dict[str, np.ndarray]) -> dict[str, float]:
+    """ADD-S in metres of the objects found whose type is in the scene, by name."""
+    points = {model.name: model.surface_points for model in library.models}
+    return {
+        o.type: add_s(points[o.type], true_poses[o.type], matrix_from_values([*o.position, *o.orientation]))
+        for o in posterior.objects
+        if o.type in true_poses
+    }
+
+
+def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> list[str]:
+    """A line per object: type, probabilities, pose, standard deviations, distance from the truth."""
     head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'position, m':<23}{'orientation xyzw':<28}"
-    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'error, mm':>9}"]
+    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'ADD-S, mm':>10}"]
     for estimate in posterior.objects:
         sigma = np.sqrt(np.diag(estimate.covariance))
         probability = estimate.type_probabilities[estimate.type]
-        true = true_positions.get(estimate.type)
-        error = "" if true is None else f"{np.linalg.norm(estimate.position - true) * 1e3:.1f}"
+        error = f"{add_s_by_type[estimate.type] * 1e3:.1f}" if estimate.type in add_s_by_type else "not there"
         lines.append(
             f"{estimate.type:<22}{probability:>8.3f}{estimate.probability:>10.3f}  "
             f"{_row(estimate.position, 3, 23)}{_row(estimate.orientation, 3, 28)}"
-            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>9}"
+            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>10}"
         )
     counts = ", ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items() if p > 5e-4)
     lines.append(f"p(number of objects) {counts}; parsed in {posterior.seconds * 1e3:.0f} ms")
