@@ -18,8 +18,10 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
+from bayes3d_ros.ros.transport import use_large_messages
 
 CLOCK_PERIOD = 0.01  # seconds of real time
+ACKNOWLEDGED_SECONDS = 4.0  # a little longer than Fast DDS takes to ask again for what was lost
 
 
 class BagPlayer(Node):
@@ -131,6 +133,7 @@ def main(args: list[str] | None = None) -> int:
     arguments = _arguments(remove_ros_args(argv)[1:])
     status = 0
     try:
+        use_large_messages()
         rclpy.init(args=argv)
         player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
         player.wait_for_subscribers(arguments.wait)
@@ -139,12 +142,15 @@ def main(args: list[str] | None = None) -> int:
             player.get_logger().info(f"played {played} messages of {arguments.bag}")
             if not arguments.loop:
                 break
-        player.finish(2.0)
+        player.finish(ACKNOWLEDGED_SECONDS)
     except BagError as error:
         sys.stderr.write(f"bag_player: {error}\n")
         status = 1 if isinstance(error, BagDamage) else 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():  # a signal between two calls of rclpy leaves the second one without a context
+            raise
     finally:
         rclpy.try_shutdown()
     return status

@@ -10,6 +10,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from bayes3d_ros.ros.transport import use_large_messages
+
 
 class StoppableNode(Protocol):
     """A node with threads of its own."""
@@ -24,11 +26,15 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     node = None
     stopped = True
     try:
+        use_large_messages()
         rclpy.init(args=args)
         node = make_node()
         rclpy.spin(cast(Node, node))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():  # a signal between two calls of rclpy leaves the second one without a context
+            raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean end short
         if node is not None:

@@ -35,3 +35,4 @@ def test_a_bundled_bag_is_parsed_by_the_node(ros, tmp_path: Path) -> None:
     pose = outputs.by_stamp[stamp]["poses"].poses[0].position
     np.testing.assert_allclose([pose.x, pose.y, pose.z], estimate.position, atol=1e-4)
     assert set(np.unique(posterior.segmentation)) == {0, 1}
+    assert not any("found in the depth" in note for note in posterior.notes)  # the camera's pose came with the image
