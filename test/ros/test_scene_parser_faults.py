@@ -148,6 +148,11 @@ def test_a_changed_setting_is_checked_and_taken(bench: Bench) -> None:
     assert "deactivate" in set_parameter("qos_reliability", "best_effort").reason
     assert set_parameter("table", "pose").successful  # no pose comes with these frames
     bench.is_refused(*bench.messages(), "no camera pose")
+    assert "camera_pose" in set_parameter("camera_pose", [0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0]).reason
+    assert set_parameter("camera_pose", [0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0]).successful
+    bench.good_frame_is_parsed()
+    assert bench.poses[-1].poses[0].position.z == 3.0  # the fake parser puts its object at the camera's height
+    assert set_parameter("camera_pose", []).successful
     assert set_parameter("table", "auto").successful
     bench.good_frame_is_parsed()
 

@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
+
+from bayes3d_ros.bags import BagWriter
+from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.bag_player import main, message_class
+
+
+@pytest.fixture
+def bag(tmp_path: Path, depth_frame) -> Path:
+    with BagWriter(tmp_path / "bag") as writer:
+        for k in range(3):
+            writer.write(depth_frame(10**9 + k * 10**7))
+    return tmp_path / "bag"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["/no/such/bag"], "/no/such/bag"),
+        (["EMPTY"], "empty.mcap"),
+        (["BAG", "--topics", "/rgb"], "/depth/image_rect"),
+        (["BAG", "--rate", "0"], "--rate"),
+        ([], "bag"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(bag: Path, arguments: list[str], named: str, capsys) -> None:
+    empty = bag.parent / "empty.mcap"
+    empty.write_bytes(b"")
+    words = [{"BAG": str(bag), "EMPTY": str(empty)}.get(word, word) for word in arguments]
+    try:
+        status = main(words)
+    except SystemExit as end:  # argparse
+        status = end.code
+    assert status == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert named in error[-1] and "Traceback" not in error
+
+
+def test_a_loop_publishes_what_was_recorded_again_and_again_with_the_clock(ros, bag: Path, depth_frame) -> None:
+    images, clock = ros.listen(Image, "/robot/depth", 100), ros.listen(Clock, "/clock", 100)
+    remap = ["--ros-args", "-r", "/depth/image_rect:=/robot/depth"]
+    words = [str(bag), "--loop", "--clock", "--rate", "2", "--topics", "/depth/image_rect", "--wait", "60"]
+    player = ros.start("-m", "bayes3d_ros.ros.bag_player", *words, *remap)
+    ros.wait_for(lambda: len(images) >= 7 and clock, "two loops")
+    stamps = [conversions.stamp_to_ns(m.header.stamp) for m in images[:7]]
+    assert stamps == [10**9 + k % 3 * 10**7 for k in range(7)]
+    np.testing.assert_allclose(conversions.depth_from_image(images[0]), depth_frame().depth, atol=6e-4)
+    times = [conversions.stamp_to_ns(m.clock) for m in clock]
+    assert min(times) >= 10**9 and max(times) <= 10**9 + 2 * 10**7
+    assert player.stop() == 0, player.output()
+
+
+def test_message_classes_are_found_by_name() -> None:
+    assert message_class("sensor_msgs/msg/Image") is Image
+    with pytest.raises(ImportError):
+        message_class("no_such_msgs/msg/Image")
+    with pytest.raises(ImportError):
+        message_class("sensor_msgs/msg/NoSuchMessage")

@@ -1,0 +1,41 @@
+import numpy as np
+
+from bayes3d_ros.model.summaries import posterior_rows
+from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.received import posterior_from_messages, samples_from_rows
+from bayes3d_ros.ros.summary import summary_message
+
+
+def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
+    posterior = fake_posterior(depth_frame(), library.names)
+    samples = samples_from_rows(posterior_rows(posterior.samples, posterior.object_index))
+    most = samples.type.shape[1]
+    for name in ("type", "face"):
+        np.testing.assert_array_equal(getattr(samples, name), getattr(posterior.samples, name)[:, :most])
+    held = samples.type >= 0
+    for name in ("position", "orientation"):
+        expected = getattr(posterior.samples, name)[:, :most]
+        np.testing.assert_allclose(getattr(samples, name)[held], expected[held], atol=1e-6)
+    for name in ("log_weight", "num_objects", "p_outlier", "sigma"):
+        np.testing.assert_allclose(getattr(samples, name), getattr(posterior.samples, name), rtol=1e-6)
+
+
+def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library) -> None:
+    posterior = fake_posterior(depth_frame(12_345), library.names)
+    messages = {
+        "posterior": conversions.posterior_cloud(posterior),
+        "poses": conversions.pose_array(posterior),
+        "summary": summary_message(posterior),
+        "segmentation": conversions.segmentation_image(posterior),
+        "depth_reconstruction": conversions.reconstruction_image(posterior),
+    }
+    again = posterior_from_messages(messages, library)
+    assert (again.stamp_ns, again.frame_id, again.types) == (12_345, "camera", library.names)
+    assert [o.type for o in again.objects] == [o.type for o in posterior.objects]
+    for mine, other in zip(again.objects, posterior.objects, strict=True):
+        np.testing.assert_allclose(mine.position, other.position, atol=1e-5)
+        np.testing.assert_allclose(mine.covariance, other.covariance, atol=1e-7)
+    np.testing.assert_array_equal(again.segmentation, posterior.segmentation)
+    np.testing.assert_allclose(again.reconstruction, posterior.reconstruction)
+    assert again.num_objects.keys() == posterior.num_objects.keys()
+    assert again.notes == posterior.notes and again.seconds == posterior.seconds
