@@ -1,6 +1,7 @@
 """From the whole space of one object to a proposal: cells scored with sketches, the best aligned to the data, the best of
 those scored with the model itself and narrowed round by round."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.alignment import align
-from bayes3d_ros.inference.mixture import Modes, Proposal, wrap
+from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, wrap
 from bayes3d_ros.inference.sketch_search import (
     YAWS,
     Evidence,
@@ -21,10 +22,14 @@ from bayes3d_ros.inference.sketch_search import (
 from bayes3d_ros.model.library_arrays import NUM_FACES, SKETCH_POINTS, LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
-from bayes3d_ros.model.scene_score import Image, log_likelihood_gain
+from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
 
-_GLOBAL, _CANDIDATES, _MODES, _DRAWS, _ROUNDS = 128, 24, 8, 16, 4
-_FIRST_SPREAD = (0.003, 0.003, 0.05)  # metres, metres, radians
+_GLOBAL, _CANDIDATES = 128, 32
+_MODES, _DRAWS, _ROUNDS = 8, 16, 3
+_FINALISTS, _FIT_DRAWS, _FIT_ROUNDS = 4, 20, 2
+_FIRST_SPREAD = (0.003, 0.003, 0.08)  # metres, metres, radians
+_WORTH = 5.0  # nats: below, no candidate is worth a search
+_INFLATION, _FLATTEN = 1.5, 4.0
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)
 
 
@@ -113,9 +118,17 @@ def candidates(
     return _sorted(contact, _distinct(contact, score, (0.008, 0.1)), _CANDIDATES)
 
 
-def _gains(contact: Contact, scene: Scene, context: Context, noise: Noise, window: int) -> Float[Array, "N"]:
+def _sorted_with(contact: Contact, score: Float[Array, "N"], count: int) -> tuple[Contact, tuple[Array, Array]]:
+    best, index = jax.lax.top_k(score, count)
+    return _take(contact, index), (best, index)
+
+
+def _gains(
+    contact: Contact, depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int
+) -> Float[Array, "N"]:
+    """Log likelihood gained over one scene at one noise level; -inf outside the prior."""
     ancestor = jnp.zeros(contact.type.shape, jnp.int32)
-    gain = log_likelihood_gain(contact, ancestor, scene.depth[None], *context, noise, window)[:, 0, 0]
+    gain = log_likelihood_gain(contact, ancestor, depth[None], *context, noise, window)[:, 0, 0]
     return jnp.where(jnp.isfinite(log_prior(contact, context.library, context.table)), gain, -jnp.inf)
 
 
@@ -136,47 +149,87 @@ def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M
     return weights(jnp.exp(low))
 
 
-def narrow(
-    key: PRNGKeyArray,
-    contact: Contact,
-    gain: Float[Array, "M"],
-    scene: Scene,
-    context: Context,
-    noise: Noise,
-    window: int,
-) -> tuple[Contact, Float[Array, "M"], Float[Array, "M 3 3"]]:
+def _draw_about(contact: Contact, offset: Float[Array, "M D 3"]) -> Contact:
+    """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
+    count = offset.shape[1]
+    return Contact(
+        jnp.repeat(contact.type[:, None], count, 1),
+        jnp.repeat(contact.face[:, None], count, 1),
+        contact.x[:, None] + offset[..., 0],
+        contact.y[:, None] + offset[..., 1],
+        contact.yaw[:, None] + offset[..., 2],
+    )
+
+
+def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
+    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
+
+
+def narrow(key: PRNGKeyArray, contact: Contact, gains: Callable) -> tuple[Contact, Float[Array, "M 3 3"]]:
     """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
-    mean and covariance serve the next round."""
+    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods."""
     spread = jnp.diag(jnp.array(_FIRST_SPREAD) ** 2)
     covariance = jnp.broadcast_to(spread, (contact.type.shape[0], 3, 3))
 
     def one_round(state, key):
-        contact, gain, covariance = state
-        noise_free = jnp.linalg.cholesky(covariance)
-        offset = jnp.einsum("mab,mdb->mda", noise_free, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
+        contact, covariance = state
+        scale = jnp.linalg.cholesky(covariance)
+        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
-        draws = Contact(
-            jnp.repeat(contact.type[:, None], _DRAWS, 1),
-            jnp.repeat(contact.face[:, None], _DRAWS, 1),
-            contact.x[:, None] + offset[..., 0],
-            contact.y[:, None] + offset[..., 1],
-            contact.yaw[:, None] + offset[..., 2],
-        )
-        value = _gains(jax.tree.map(jnp.ravel, draws), scene, context, noise, window).reshape(-1, _DRAWS)
-        weight = _temper(jnp.maximum(value, -1e9), 5.0)  # a mode outside the prior must not breed NaN
-        mean = jnp.einsum("md,mda->ma", weight, offset)
-        centred = offset - mean[:, None]
+        value = gains(jax.tree.map(jnp.ravel, _draw_about(contact, offset))).reshape(offset.shape[:2])
+        value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
+        weight = _temper(value, 5.0)
+        centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
-        best = jnp.argmax(value, 1)
-        rows = jnp.arange(contact.type.shape[0])
-        contact = _take(jax.tree.map(lambda a: a[rows, 0], draws), rows)._replace(
-            x=draws.x[rows, best], y=draws.y[rows, best], yaw=draws.yaw[rows, best]
-        )
+        best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
-        return (contact, value[rows, best], 1.2 * learned + 0.02 * covariance + floor), None
+        return (_move(contact, best), 1.2 * learned + 0.02 * covariance + floor), None
 
-    state, _ = jax.lax.scan(one_round, (contact, gain, covariance), jax.random.split(key, _ROUNDS))
-    return state
+    return jax.lax.scan(one_round, (contact, covariance), jax.random.split(key, _ROUNDS))[0]
+
+
+def sharpen(
+    key: PRNGKeyArray, contact: Contact, covariance: Float[Array, "M 3 3"], gains: Callable
+) -> tuple[Contact, Float[Array, "M 3 3"], Float[Array, "M"]]:
+    """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
+    mode's covariance. Returns modes, covariances and the best log likelihood met."""
+
+    def one_round(state, key):
+        contact, covariance = state
+        scale = jnp.linalg.cholesky(covariance)
+        step = jax.random.normal(key, (*contact.type.shape, _FIT_DRAWS, 3)).at[:, 0].set(0.0)
+        draws = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
+        value = gains(jax.tree.map(jnp.ravel, draws)).reshape(step.shape[:2])
+        value = jnp.maximum(value, -1e9)
+        best = jnp.argmax(value, 1)
+        height = value - value.max(1, keepdims=True)
+        weight = _temper(height, 14.0)
+        i, j = jnp.triu_indices(3)
+        square = step[..., i] * step[..., j] * jnp.where(i == j, 0.5, 1.0)
+        features = jnp.concatenate([jnp.ones_like(step[..., :1]), step, square], -1)
+        gram = jnp.einsum("md,mda,mdb->mab", weight, features, features) + 1e-4 * jnp.eye(10)
+        target = jnp.einsum("md,mda,md->ma", weight, features, jnp.maximum(height, -1e5))
+        fit = jnp.linalg.solve(gram, target[..., None])[..., 0]
+        slope = fit[:, 1:4]
+        upper = jnp.zeros((len(fit), 3, 3)).at[:, i, j].set(fit[:, 4:])
+        curvature = upper + upper.transpose(0, 2, 1) - upper * jnp.eye(3)
+        value_along, along = jnp.linalg.eigh(-curvature)
+        value_along = jnp.clip(value_along, 0.15, 1e4)
+        top = jnp.einsum("mab,mb,mcb,mc->ma", along, 1 / value_along, along, slope)
+        top = top / jnp.maximum(1, jnp.linalg.norm(top, axis=1, keepdims=True) / 2.5)
+        # Where the fit's top lies far from the best draw, trust the draw.
+        seen = jnp.take_along_axis(step, best[:, None, None], 1)[:, 0]
+        off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
+        top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
+        inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
+        covariance = jnp.einsum("mab,mbc,mdc->mad", scale, inverse, scale)
+        covariance += jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
+        return (_move(contact, jnp.einsum("mab,mb->ma", scale, top)), covariance), value.max(1)
+
+    (contact, covariance), values = jax.lax.scan(
+        one_round, (contact, covariance), jax.random.split(key, _FIT_ROUNDS)
+    )
+    return contact, covariance, values[-1]
 
 
 def find_proposal(
@@ -193,18 +246,42 @@ def find_proposal(
     height, width = image.depth.shape
     half = window // 2
     shape = cell_grid(table_size)
-    evidence = evidence_left(scene.depth[half : half + height, half : half + width], image, noise)
+    depth = scene.depth[half : half + height, half : half + width]
+    evidence = evidence_left(depth, image, noise)
     contact, score = candidates(scene, evidence, context, shape, overlap_limit)
-    gain = jnp.where(jnp.isfinite(score), _gains(contact, scene, context, noise, window), -jnp.inf)
+
+    small = Context(halved(image), library, table)
+    small_depth = pad_scene(depth[::2, ::2], window)
+
+    def rough(contact: Contact) -> Float[Array, "N"]:
+        return 4 * _gains(contact, small_depth, small, noise, window)
+
+    def exact(contact: Contact) -> Float[Array, "N"]:
+        return _gains(contact, scene.depth, context, noise, window)
+
+    gain = jnp.where(jnp.isfinite(score), rough(contact), -jnp.inf)
     contact, gain = _sorted(contact, gain, _CANDIDATES)
     contact, gain = _sorted(contact, _distinct(contact, gain, (0.004, 0.05)), _MODES)
-    real = jnp.isfinite(gain)
-    contact, gain, covariance = narrow(key, contact, gain, scene, context, noise, window)
-    scale = jnp.linalg.cholesky(1.5 * covariance)
+    worth = gain[0] > _WORTH
+
+    def search():
+        narrow_key, sharpen_key = jax.random.split(key)
+        modes, covariance = narrow(narrow_key, contact, rough)
+        modes, value = _sorted_with(modes, rough(modes), _FINALISTS)
+        covariance = covariance[value[1]]
+        return sharpen(sharpen_key, modes, covariance, exact)
+
+    def nothing():
+        spread = jnp.diag(jnp.array(_FIRST_SPREAD) ** 2)
+        few = jax.tree.map(lambda a: a[:_FINALISTS], contact)
+        return few, jnp.broadcast_to(spread, (_FINALISTS, 3, 3)), jnp.zeros(_FINALISTS)
+
+    modes, covariance, value = jax.lax.cond(worth, search, nothing)
+    scale = jnp.linalg.cholesky(_INFLATION * covariance)
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     # Flattened: the gains are rough, and a mode that is missed costs more than one that is tried in vain.
-    log_weight = jnp.where(real, (gain + log_volume) / 4, -jnp.inf)
-    log_weight = jnp.logaddexp(jax.nn.log_softmax(log_weight), jnp.where(real, jnp.log(0.05 / _MODES), -jnp.inf))
-    log_weight = jnp.where(real.any(), log_weight, 0.0)
+    log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
+    log_weight = jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / _FINALISTS)))
     cells = hidden_cells(image, table, shape)
-    return Proposal(Modes(contact, scale, jax.nn.log_softmax(log_weight)), cells / cells.sum())
+    shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
+    return Proposal(Modes(modes, scale, log_weight), cells / cells.sum(), shares)

@@ -15,7 +15,8 @@ from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.model.scene_graph import Contact, Table
 
 _DEGREES_OF_FREEDOM = 4.0
-MODES, FLOOR_HIDDEN, FLOOR_PRIOR = 0.84, 0.12, 0.04  # shares of the proposal
+# Shares of the proposal: the modes, where something could hide, anywhere. Without modes worth trying the floor has it all.
+SHARES, SHARES_WITHOUT_MODES = (0.84, 0.12, 0.04), (0.0, 0.7, 0.3)
 
 
 class Modes(NamedTuple):
@@ -28,7 +29,8 @@ class Modes(NamedTuple):
 
 class Proposal(NamedTuple):
     modes: Modes
-    cells: Float[Array, "X Y"]  # probability of each cell of the table for the floor
+    cells: Float[Array, "X Y"]  # probability of each cell of the table, for what could hide there
+    shares: Float[Array, "3"]
 
 
 def wrap(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -51,9 +53,7 @@ def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryA
     corner = jnp.stack([cell // proposal.cells.shape[1], cell % proposal.cells.shape[1]], -1) * CELL - table.size / 2
     hidden = corner + CELL * jax.random.uniform(keys[7], (count, 2))
     anywhere = (jax.random.uniform(keys[8], (count, 2)) - 0.5) * (table.size - library.face_size[kind, face])
-    source = jax.random.choice(
-        keys[9], 3, (count,), p=jnp.array([MODES, FLOOR_HIDDEN, FLOOR_PRIOR])
-    )
+    source = jax.random.choice(keys[9], 3, (count,), p=proposal.shares)
     floor = jnp.where((source == 1)[:, None], hidden, anywhere)
     at_mode = source == 0
     return Contact(
@@ -90,6 +90,7 @@ def log_density(contact: Contact, proposal: Proposal, library: LibraryArrays, ta
     index = jnp.floor((jnp.stack([contact.x, contact.y], -1) + table.size / 2) / CELL).astype(jnp.int32)
     inside = ((index >= 0) & (index < shape)).all(-1)
     index = jnp.clip(index, 0, shape - 1)
+    log_share = jnp.log(proposal.shares)
     log_discrete = -jnp.log(library.num_types * NUM_FACES * 2 * jnp.pi)
     hidden = jnp.log(proposal.cells[index[:, 0], index[:, 1]]) - 2 * jnp.log(CELL)
     free = table.size - library.face_size[contact.type, contact.face]
@@ -97,9 +98,9 @@ def log_density(contact: Contact, proposal: Proposal, library: LibraryArrays, ta
     return jax.nn.logsumexp(
         jnp.stack(
             [
-                jax.nn.logsumexp(at_mode, 1) + jnp.log(MODES),
-                jnp.where(inside, hidden + log_discrete + jnp.log(FLOOR_HIDDEN), -jnp.inf),
-                jnp.where(anywhere, -jnp.log(free[:, 0] * free[:, 1]) + log_discrete + jnp.log(FLOOR_PRIOR), -jnp.inf),
+                jax.nn.logsumexp(at_mode, 1) + log_share[0],
+                jnp.where(inside, hidden + log_discrete + log_share[1], -jnp.inf),
+                jnp.where(anywhere, -jnp.log(free[:, 0] * free[:, 1]) + log_discrete + log_share[2], -jnp.inf),
             ]
         ),
         0,

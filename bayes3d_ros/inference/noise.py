@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 
 from bayes3d_ros.model.likelihood import Noise
 
-_SIGMA_STEPS, _P_STEPS = 14, 12  # coarse grid: sigma_max 2^(-k/4), logit p
-_SIGMA_FINE, _P_FINE = 12, 16  # fine points between coarse ones
+_SIGMA_STEPS, _P_STEPS = 11, 12  # coarse grid: sigma_max 2^(-k/3), logit p
+_SIGMA_FINE, _P_FINE = 16, 16  # fine points between coarse ones
 _P_LOW, _P_HIGH = 1e-3, 0.9
 
 
@@ -31,7 +31,7 @@ class NoiseGrid(NamedTuple):
 
 def noise_grid(sigma_max: float) -> NoiseGrid:
     """sigma ~ U(0, sigma_max) and p_outlier ~ U(0, 1), both proper; the mass below the grid's ends is left out."""
-    u = np.log(sigma_max) - np.log(2) / 4 * np.arange(_SIGMA_STEPS)[::-1]
+    u = np.log(sigma_max) - np.log(2) / 3 * np.arange(_SIGMA_STEPS)[::-1]
     v = np.linspace(_logit(_P_LOW), _logit(_P_HIGH), _P_STEPS)
     u_fine = np.linspace(u[0], u[-1], (len(u) - 1) * _SIGMA_FINE + 1)
     v_fine = np.linspace(v[0], v[-1], (len(v) - 1) * _P_FINE + 1)

@@ -20,7 +20,7 @@ CELL = 0.02  # metres
 YAWS = 24
 MAX_CELLS = 512
 _BLOCK = 4  # cells a step
-_COARSE_POINTS = 48
+_COARSE_POINTS = 36
 # Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
 _COARSE_TOLERANCE, _COARSE_PENALTY = 0.02, 0.25
 _REACH = 3  # cells: how far from unexplained returns an object's centre is looked for

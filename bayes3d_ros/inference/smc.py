@@ -19,7 +19,7 @@ from bayes3d_ros.inference.mixture import log_density, propose
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.resampling import effective_fraction, systematic
 from bayes3d_ros.model.scene_graph import Contact, log_prior
-from bayes3d_ros.model.scene_score import add_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import add_objects, log_likelihood_scene, pad_scene
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
 _LAST_SCALE = 30.0  # pixels, of the backward kernel
@@ -97,8 +97,7 @@ def step(
     new = propose(draw_key, proposal, particles, context.library, context.table)
     log_q = log_density(new, proposal, context.library, context.table)
 
-    gain = log_likelihood_gain(new, jnp.arange(particles), state.scenes, *context, grid.coarse, window)
-    scenes, covered = add_objects(new, state.scenes, *context, window)
+    gain, scenes, covered = add_objects(new, state.scenes, *context, grid.coarse, window)
     table = state.table + gain
     log_likelihood = noise_model.log_marginal(table, grid)
     log_p = log_prior(new, context.library, context.table)
