@@ -26,7 +26,8 @@ from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pa
 
 _GLOBAL, _CANDIDATES = 128, 32
 _MODES, _DRAWS, _ROUNDS = 8, 16, 3
-_FINALISTS, _FIT_DRAWS, _FIT_ROUNDS = 4, 20, 2
+_FINALISTS, _LEADERS = 4, 2
+_FIT_ALL, _FIT_LEADERS = (20, 2), (40, 1)  # draws a mode, rounds
 _FIRST_SPREAD = (0.003, 0.003, 0.08)  # metres, metres, radians
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 _INFLATION, _FLATTEN = 1.5, 4.0
@@ -189,7 +190,7 @@ def narrow(key: PRNGKeyArray, contact: Contact, gains: Callable) -> tuple[Contac
 
 
 def sharpen(
-    key: PRNGKeyArray, contact: Contact, covariance: Float[Array, "M 3 3"], gains: Callable
+    key: PRNGKeyArray, contact: Contact, covariance: Float[Array, "M 3 3"], gains: Callable, draws: int, rounds: int
 ) -> tuple[Contact, Float[Array, "M 3 3"], Float[Array, "M"]]:
     """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
     mode's covariance. Returns modes, covariances and the best log likelihood met."""
@@ -197,13 +198,13 @@ def sharpen(
     def one_round(state, key):
         contact, covariance = state
         scale = jnp.linalg.cholesky(covariance)
-        step = jax.random.normal(key, (*contact.type.shape, _FIT_DRAWS, 3)).at[:, 0].set(0.0)
-        draws = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
-        value = gains(jax.tree.map(jnp.ravel, draws)).reshape(step.shape[:2])
+        step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
+        about = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
+        value = gains(jax.tree.map(jnp.ravel, about)).reshape(step.shape[:2])
         value = jnp.maximum(value, -1e9)
         best = jnp.argmax(value, 1)
         height = value - value.max(1, keepdims=True)
-        weight = _temper(height, 14.0)
+        weight = _temper(height, 0.6 * draws)
         i, j = jnp.triu_indices(3)
         square = step[..., i] * step[..., j] * jnp.where(i == j, 0.5, 1.0)
         features = jnp.concatenate([jnp.ones_like(step[..., :1]), step, square], -1)
@@ -227,7 +228,7 @@ def sharpen(
         return (_move(contact, jnp.einsum("mab,mb->ma", scale, top)), covariance), value.max(1)
 
     (contact, covariance), values = jax.lax.scan(
-        one_round, (contact, covariance), jax.random.split(key, _FIT_ROUNDS)
+        one_round, (contact, covariance), jax.random.split(key, rounds)
     )
     return contact, covariance, values[-1]
 
@@ -265,11 +266,17 @@ def find_proposal(
     worth = gain[0] > _WORTH
 
     def search():
-        narrow_key, sharpen_key = jax.random.split(key)
+        narrow_key, first_key, last_key = jax.random.split(key, 3)
         modes, covariance = narrow(narrow_key, contact, rough)
         modes, value = _sorted_with(modes, rough(modes), _FINALISTS)
         covariance = covariance[value[1]]
-        return sharpen(sharpen_key, modes, covariance, exact)
+        modes, covariance, value = sharpen(first_key, modes, covariance, exact, *_FIT_ALL)
+        # The leaders once more, with more draws: the posterior is mostly theirs.
+        value, order = jax.lax.top_k(value, _FINALISTS)
+        modes, covariance = _take(modes, order), covariance[order]
+        lead = slice(0, _LEADERS)
+        led = sharpen(last_key, _take(modes, lead), covariance[lead], exact, *_FIT_LEADERS)
+        return jax.tree.map(lambda best, rest: jnp.concatenate([best, rest[_LEADERS:]]), led, (modes, covariance, value))
 
     def nothing():
         spread = jnp.diag(jnp.array(_FIRST_SPREAD) ** 2)
