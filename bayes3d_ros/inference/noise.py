@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
 from bayes3d_ros.model.likelihood import Noise
@@ -73,9 +73,10 @@ def log_marginal(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, 
 def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
     """One draw of (sigma, p_outlier) per particle given its scene."""
     fine = _fine(table, grid)
-    index: Int[Array, "N"] = jax.random.categorical(key, fine.reshape(len(fine), -1))
-    columns = fine.shape[-1]
-    return Noise(grid.fine.sigma[index // columns], grid.fine.p_outlier[index % columns])
+    sigma_key, p_key = jax.random.split(key)
+    sigma = jax.random.categorical(sigma_key, jax.nn.logsumexp(fine, -1))
+    p = jax.random.categorical(p_key, jnp.take_along_axis(fine, sigma[:, None, None], 1)[:, 0])
+    return Noise(grid.fine.sigma[sigma], grid.fine.p_outlier[p])
 
 
 def peak(table: Float[Array, "S P"], grid: NoiseGrid) -> Noise:
