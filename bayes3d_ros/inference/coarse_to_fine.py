@@ -2,7 +2,7 @@
 those scored with the model itself and narrowed round by round."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +24,13 @@ from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
 from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
 
+T = TypeVar("T")
 _GLOBAL, _CANDIDATES = 128, 32
-_MODES, _DRAWS, _ROUNDS = 8, 16, 3
+_MODES, _DRAWS, _ROUNDS = 8, 20, 4
 _FINALISTS, _LEADERS = 4, 2
-_FIT_ALL, _FIT_LEADERS = (20, 2), (40, 1)  # draws a mode, rounds
-_FIRST_SPREAD = (0.003, 0.003, 0.08)  # metres, metres, radians
+_FIT_ALL, _FIT_LEADERS = (20, 2), (40, 2)  # draws a mode, rounds
+_LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
+_ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 _INFLATION, _FLATTEN = 1.5, 4.0
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)
@@ -73,8 +75,15 @@ def conflicts(contact: Contact, others: Contact, count: Int[Array, "*n"], librar
     return worst > limit
 
 
-def _take(contact: Contact, index: Array) -> Contact:
-    return jax.tree.map(lambda a: a[index], contact)
+class Hypotheses(NamedTuple):
+    """Objects, with how far off in (x, y, yaw) each may be."""
+
+    contact: Contact  # [N]
+    covariance: Float[Array, "N 3 3"]
+
+
+def _take(tree: T, index: Array | slice) -> T:
+    return jax.tree.map(lambda a: a[index], tree)
 
 
 def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
@@ -86,14 +95,14 @@ def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, flo
     return jnp.where(better.any(1), -jnp.inf, score)
 
 
-def _sorted(contact: Contact, score: Float[Array, "N"], count: int) -> tuple[Contact, Float[Array, "count"]]:
+def _sorted(tree: T, score: Float[Array, "N"], count: int) -> tuple[T, Float[Array, "count"]]:
     best, index = jax.lax.top_k(score, count)
-    return _take(contact, index), best
+    return _take(tree, index), best
 
 
 def candidates(
     scene: Scene, evidence: Evidence, context: Context, shape: tuple[int, int], overlap_limit: float
-) -> tuple[Contact, Float[Array, "C"]]:
+) -> tuple[Hypotheses, Float[Array, "C"]]:
     """The coarse levels: scored cells, the best of them aligned, near-copies and impossible ones dropped."""
     image, library, table = context
     centres, count = cells_to_search(evidence, image, table, shape)
@@ -110,13 +119,15 @@ def candidates(
     face = jnp.concatenate([face, jnp.tile(jnp.arange(NUM_FACES), kinds)])
     coarse = jnp.concatenate([best, per_face.max(1)])
     contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
-    contact, _ = align(contact, evidence, image, library, table)
+    contact, information = align(contact, evidence, image, library, table)
+    loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
+    found = Hypotheses(contact, jnp.linalg.inv(information / _ALIGNED**2 + loose))
     score = sketch_score(contact, evidence, image, library, table, 0.01, 0.5, SKETCH_POINTS)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(contact, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(contact, others, scene.count, library, overlap_limit)
-    contact, score = _sorted(contact, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    return _sorted(contact, _distinct(contact, score, (0.008, 0.1)), _CANDIDATES)
+    found, score = _sorted(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
+    return _sorted(found, _distinct(found.contact, score, (0.008, 0.1)), _CANDIDATES)
 
 
 def _sorted_with(contact: Contact, score: Float[Array, "N"], count: int) -> tuple[Contact, tuple[Array, Array]]:
@@ -166,13 +177,11 @@ def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
     return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
 
 
-def narrow(key: PRNGKeyArray, contact: Contact, gains: Callable) -> tuple[Contact, Float[Array, "M 3 3"]]:
+def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> Hypotheses:
     """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
     best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods."""
-    spread = jnp.diag(jnp.array(_FIRST_SPREAD) ** 2)
-    covariance = jnp.broadcast_to(spread, (contact.type.shape[0], 3, 3))
 
-    def one_round(state, key):
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, None]:
         contact, covariance = state
         scale = jnp.linalg.cholesky(covariance)
         offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
@@ -184,18 +193,18 @@ def narrow(key: PRNGKeyArray, contact: Contact, gains: Callable) -> tuple[Contac
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
-        return (_move(contact, best), 1.2 * learned + 0.02 * covariance + floor), None
+        return Hypotheses(_move(contact, best), 1.2 * learned + 0.05 * covariance + floor), None
 
-    return jax.lax.scan(one_round, (contact, covariance), jax.random.split(key, _ROUNDS))[0]
+    return jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))[0]
 
 
 def sharpen(
-    key: PRNGKeyArray, contact: Contact, covariance: Float[Array, "M 3 3"], gains: Callable, draws: int, rounds: int
-) -> tuple[Contact, Float[Array, "M 3 3"], Float[Array, "M"]]:
+    key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
+) -> tuple[Hypotheses, Float[Array, "M"]]:
     """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
-    mode's covariance. Returns modes, covariances and the best log likelihood met."""
+    mode's covariance. Returns the modes and the best log likelihood met."""
 
-    def one_round(state, key):
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         contact, covariance = state
         scale = jnp.linalg.cholesky(covariance)
         step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
@@ -225,12 +234,11 @@ def sharpen(
         inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
         covariance = jnp.einsum("mab,mbc,mdc->mad", scale, inverse, scale)
         covariance += jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
-        return (_move(contact, jnp.einsum("mab,mb->ma", scale, top)), covariance), value.max(1)
+        moved = _move(contact, jnp.einsum("mab,mb->ma", scale, top))
+        return Hypotheses(moved, covariance), value.max(1)
 
-    (contact, covariance), values = jax.lax.scan(
-        one_round, (contact, covariance), jax.random.split(key, rounds)
-    )
-    return contact, covariance, values[-1]
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
+    return modes, values[-1]
 
 
 def find_proposal(
@@ -249,7 +257,7 @@ def find_proposal(
     shape = cell_grid(table_size)
     depth = scene.depth[half : half + height, half : half + width]
     evidence = evidence_left(depth, image, noise)
-    contact, score = candidates(scene, evidence, context, shape, overlap_limit)
+    found, score = candidates(scene, evidence, context, shape, overlap_limit)
 
     small = Context(halved(image), library, table)
     small_depth = pad_scene(depth[::2, ::2], window)
@@ -260,35 +268,29 @@ def find_proposal(
     def exact(contact: Contact) -> Float[Array, "N"]:
         return _gains(contact, scene.depth, context, noise, window)
 
-    gain = jnp.where(jnp.isfinite(score), rough(contact), -jnp.inf)
-    contact, gain = _sorted(contact, gain, _CANDIDATES)
-    contact, gain = _sorted(contact, _distinct(contact, gain, (0.004, 0.05)), _MODES)
+    found, gain = _sorted(found, jnp.where(jnp.isfinite(score), rough(found.contact), -jnp.inf), _CANDIDATES)
+    found, gain = _sorted(found, _distinct(found.contact, gain, (0.004, 0.05)), _MODES)
     worth = gain[0] > _WORTH
 
-    def search():
+    def search() -> tuple[Hypotheses, Float[Array, "M"]]:
         narrow_key, first_key, last_key = jax.random.split(key, 3)
-        modes, covariance = narrow(narrow_key, contact, rough)
-        modes, value = _sorted_with(modes, rough(modes), _FINALISTS)
-        covariance = covariance[value[1]]
-        modes, covariance, value = sharpen(first_key, modes, covariance, exact, *_FIT_ALL)
+        modes = narrow(narrow_key, found, rough)
+        modes, _ = _sorted(modes, rough(modes.contact), _FINALISTS)
+        modes, value = sharpen(first_key, modes, exact, *_FIT_ALL)
         # The leaders once more, with more draws: the posterior is mostly theirs.
-        value, order = jax.lax.top_k(value, _FINALISTS)
-        modes, covariance = _take(modes, order), covariance[order]
-        lead = slice(0, _LEADERS)
-        led = sharpen(last_key, _take(modes, lead), covariance[lead], exact, *_FIT_LEADERS)
-        return jax.tree.map(lambda best, rest: jnp.concatenate([best, rest[_LEADERS:]]), led, (modes, covariance, value))
+        modes, value = _sorted(modes, value, _FINALISTS)
+        led = sharpen(last_key, _take(modes, slice(_LEADERS)), exact, *_FIT_LEADERS)
+        return jax.tree.map(lambda best, all_: jnp.concatenate([best, all_[_LEADERS:]]), led, (modes, value))
 
-    def nothing():
-        spread = jnp.diag(jnp.array(_FIRST_SPREAD) ** 2)
-        few = jax.tree.map(lambda a: a[:_FINALISTS], contact)
-        return few, jnp.broadcast_to(spread, (_FINALISTS, 3, 3)), jnp.zeros(_FINALISTS)
+    def nothing() -> tuple[Hypotheses, Float[Array, "M"]]:
+        return _take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS)
 
-    modes, covariance, value = jax.lax.cond(worth, search, nothing)
-    scale = jnp.linalg.cholesky(_INFLATION * covariance)
+    modes, value = jax.lax.cond(worth, search, nothing)
+    scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     # Flattened: the gains are rough, and a mode that is missed costs more than one that is tried in vain.
     log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
     log_weight = jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / _FINALISTS)))
     cells = hidden_cells(image, table, shape)
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
-    return Proposal(Modes(modes, scale, log_weight), cells / cells.sum(), shares)
+    return Proposal(Modes(modes.contact, scale, log_weight), cells / cells.sum(), shares)
