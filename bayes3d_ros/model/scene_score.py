@@ -75,6 +75,7 @@ def _over_tiles(work, carry, contact, image, library, table, half):
     T = T_camera_object(contact, library, table)
     tiles = _tiles(T, contact.type, image, library, half)
     total, count = tiles.first[-1], contact.type.shape[0]
+    height, width = image.depth.shape
     offset = jnp.arange(-half, TILE + half)
     render = renderers["march"]
 
@@ -91,6 +92,9 @@ def _over_tiles(work, carry, contact, image, library, table, half):
         x = jnp.broadcast_to((u + offset[:, None] - image.centre[0]) / image.focal[0], shape)
         y = jnp.broadcast_to(((v + offset[:, None] - image.centre[1]) / image.focal[1])[:, None], shape)
         depth = render(library, contact.type[n], T[n], (x, y))
+        # The scene's image ends at its rim: what is rendered beyond it belongs to no window.
+        column, row = u + offset[:, None], (v + offset[:, None])[:, None]
+        depth = jnp.where((column >= 0) & (column < width) & (row >= 0) & (row < height), depth, jnp.inf)
         return start + CHUNK, work(carry, n, u, v, depth, real)
 
     return jax.lax.while_loop(lambda state: state[0] < total, chunk, (jnp.int32(0), carry))[1]

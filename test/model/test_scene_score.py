@@ -127,7 +127,6 @@ def test_gain_is_the_difference_of_whole_images(gains, at_the_rim):
     np.testing.assert_allclose(gain, expected, atol=0.01, rtol=1e-5)
 
 
-@pytest.mark.xfail(reason="windows of tiles see an object beyond the image's edge; scenes are not kept there")
 def test_gain_at_the_rim_of_the_image(gains, at_the_rim):
     gain, expected = (a[at_the_rim] for a in gains)
     np.testing.assert_allclose(gain, expected, atol=0.01, rtol=1e-5)
