@@ -1,7 +1,9 @@
 """The `bayes3d` command. Exit status: 0, 1 (failed), 2 (bad usage or input: one line on stderr)."""
 
 import os
+import traceback
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,26 +29,57 @@ class InputError(click.ClickException):
 
 
 class _OneLineErrors(click.Group):
-    """Turns the package's own errors, which are one line each, into exit status 1 or 2."""
+    """Turns every error into one line and exit status 1 or 2. BAYES3D_TRACEBACK=1 shows where it was raised as well."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with _one_line():
+            return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        try:
+        with _one_line():
             return super().invoke(ctx)
-        except (click.ClickException, click.Abort, click.exceptions.Exit):
-            raise
-        except KeyboardInterrupt:
-            raise click.ClickException("interrupted; what was finished is kept") from None
-        except OSError as error:
-            raise click.ClickException(f"{error.filename or 'input or output'}: {error.strerror or error}") from error
-        except Exception as error:
-            from bayes3d_ros.model.posterior import ParseError
 
-            line = " ".join(str(error).split())
-            if isinstance(error, ParseError):
-                raise click.ClickException(line) from error
-            if isinstance(error, _input_errors()):
-                raise InputError(line) from error
-            raise
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
+    except _HELP:
+        raise
+    except click.UsageError as error:  # click would add two lines of usage
+        command = error.ctx.command_path if error.ctx else "bayes3d"
+        raise InputError(f"{error.format_message().rstrip('.')}; see {command} --help") from None
+    except (click.ClickException, click.Abort, click.exceptions.Exit):
+        raise
+    except KeyboardInterrupt:
+        raise click.ClickException("interrupted; what was finished is kept") from None
+    except Exception as error:
+        if os.environ.get("BAYES3D_TRACEBACK"):
+            traceback.print_exc()
+        raise _as_one_line(error) from error
+
+
+def _as_one_line(error: Exception) -> click.ClickException:
+    """Bad input, a failure, or a mistake of this program."""
+    from bayes3d_ros.model.posterior import ParseError
+
+    line = " ".join(str(error).split())
+    if isinstance(error, _input_errors()):
+        return InputError(line)
+    if isinstance(error, ParseError):
+        return click.ClickException(line)
+    if isinstance(error, OSError):
+        kind = InputError if isinstance(error, _WRONG_PATH) else click.ClickException
+        return kind(f"{error.filename or 'input or output'}: {error.strerror or line}")
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{Path(where.filename).name}, line {where.lineno}"
+    return click.ClickException(
+        f"internal error, please report it: {type(error).__name__}: {line} ({place}; BAYES3D_TRACEBACK=1 shows more)"
+    )
+
+
+_HELP = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # click 8.1 exits instead
+_WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 
 def _input_errors() -> tuple[type[Exception], ...]:
@@ -113,8 +146,9 @@ def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     frames = read_frames(bag, topic)
     done, failed = _parse_frames(frames, models, settings, out)
     if failed and not done:
-        raise click.ClickException(f"{bag}: none of the {failed} frames could be parsed")
-    click.echo(f"{done} frames parsed" + (f", {failed} could not be" if failed else "") + f"; results in {out}")
+        raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
+    parsed = f"{done} frame{'s' * (done != 1)} parsed" + (f", {failed} could not be" if failed else "")
+    click.echo(f"{parsed}; results in {out}")
 
 
 def _parser_settings(more: tuple[str, ...], options: dict[str, Any]) -> "ParserSettings":
@@ -239,12 +273,18 @@ def bench(file: Path | None) -> None:
     for key, value in (report["machine"] | report["versions"]).items():
         click.echo(f"{key:<12} {value}")
     click.echo(benchmark.HEADER)
+
+    def write() -> None:
+        if file is not None:
+            file.write_text(json.dumps(report, indent=1) + "\n")
+
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write()  # now, so that a file that cannot be written to is known before minutes of measuring
     for row in _progress(benchmark.rows(), benchmark.count(), "row"):
         report["rows"].append(row)
         _say(benchmark.line(row))
-        if file is not None:  # after every row: an interrupted run leaves what it measured
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(report, indent=1) + "\n")
+        write()  # after every row: an interrupted run leaves what it measured
 
 
 def _progress(items: Any, total: int, unit: str) -> "Iterator[Any]":
@@ -263,4 +303,4 @@ def _say(text: str, err: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(prog_name="bayes3d")

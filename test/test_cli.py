@@ -110,7 +110,7 @@ def test_every_frame_failing_is_a_failure(bag, library, parsers, tmp_path):
     assert result.exit_code == 1
     *reasons, last = result.stderr.strip().splitlines()
     assert len(reasons) == 3 and all("no table in sight" in line for line in reasons)
-    assert "none of the 3 frames" in last
+    assert "none of its frames" in last
 
 
 def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers, tmp_path):
@@ -129,6 +129,13 @@ def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers,
         (["--set", "nonsense=1"], "nonsense"),
         (["--set", "window=wide"], "window=int"),
         (["--set", "window=4"], "odd"),
+        (["--set", "far=inf"], "far must lie in"),
+        (["--set", "sigma_max=nan"], "sigma_max must lie in"),
+        (["--max-objects", "-1"], "max_objects must lie in"),
+        (["--particles", "many"], "--particles"),
+        (["--nonsense"], "--nonsense"),
+        (["--table", "wood"], "'auto', 'pose', 'depth'"),
+        (["too", "much"], "unexpected extra arguments"),
         (["--topic", "/other"], "/depth/image_rect"),
     ],
 )
@@ -145,9 +152,55 @@ def test_bad_files_are_named(bag, library, parsers, tmp_path):
     assert_one_line(run("parse", bag, "--library", library, *out), 2, library / "block.npz")
     (tmp_path / "file").write_text("")
     save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01), library)
-    assert run("parse", bag, "--library", library, "--out", tmp_path / "file").exit_code == 2
+    bad_out = ("parse", bag, "--library", library, "--out")
+    assert_one_line(run(*bad_out, tmp_path / "file"), 2, tmp_path / "file")
+    assert_one_line(run(*bad_out, tmp_path / "file" / "sub"), 2, tmp_path / "file" / "sub")
+    assert_one_line(run("parse", bag, "--library", tmp_path / "file", *out), 2, tmp_path / "file", "is a file")
+    assert_one_line(run("parse", library, "--library", library, *out), 2, library, "expected an .mcap file")
     assert_one_line(run("simulate", missing, "--out", tmp_path / "new"), 2, missing)
     assert_one_line(run("import", missing, "--library", library), 2, missing)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["nonsense"], "'nonsense'"),
+        (["--nonsense"], "--nonsense"),
+        (["parse"], "'BAG'"),
+        (["parse", "bag", "--library"], "'--library'"),
+        (["import", "mesh.stl"], "'--library'"),
+        (["simulate", "scene.yaml"], "'--out'"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, word):
+    assert_one_line(run(*arguments), 2, word, "--help")
+
+
+def test_a_mesh_that_is_none_and_a_library_that_cannot_be_written(tmp_path):
+    (tmp_path / "file.stl").write_bytes(b"\x00" * 200)
+    trimesh.creation.box((0.05, 0.04, 0.03)).export(tmp_path / "box.stl")
+    assert_one_line(run("import", tmp_path / "file.stl", "--library", tmp_path / "new"), 2, tmp_path / "file.stl")
+    assert not (tmp_path / "new").exists()
+    inside_a_file = tmp_path / "box.stl" / "library"
+    assert_one_line(run("import", tmp_path / "box.stl", "--library", inside_a_file), 2, inside_a_file)
+
+
+def test_a_mistake_of_the_program_is_one_line_too(bag, library, parsers, tmp_path, monkeypatch):
+    def broken(posterior):
+        raise ZeroDivisionError("by nought")
+
+    monkeypatch.setattr(cli, "_frame_line", broken)
+    result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
+    assert_one_line(result, 1, "internal error", "ZeroDivisionError: by nought", "test_cli.py")
+    assert (tmp_path / "out" / "samples.npz").exists()
+    monkeypatch.setenv("BAYES3D_TRACEBACK", "1")
+    assert "Traceback" in run("parse", bag, "--library", library, "--out", tmp_path / "out").stderr
+
+
+def test_bench_finds_out_early_that_it_cannot_write(tmp_path, monkeypatch):
+    monkeypatch.setattr("bayes3d_ros.evaluation.benchmark.rows", lambda: pytest.fail("measured first"))
+    (tmp_path / "file").write_text("")
+    assert_one_line(run("bench", "--json", tmp_path / "file" / "bench.json"), 2, tmp_path / "file")
 
 
 def test_no_gpu_is_one_line(bag, library, parsers, tmp_path, monkeypatch):
