@@ -19,8 +19,11 @@ def validate(settings: Any) -> None:
         if meta.get("choices") and value not in meta["choices"]:
             raise ValueError(f"{f.name} must be one of {', '.join(meta['choices'])}, got {value!r}")
         low, high = meta.get("low"), meta.get("high")
+        # Not `value < low`: NaN is out of every range.
         if (low is not None and not value >= low) or (high is not None and not value <= high):
-            raise ValueError(f"{f.name} must lie in [{low}, {high}] {meta['unit']}, got {value}".replace(" ,", ","))
+            ends = {(False, False): f"lie in [{low}, {high}]", (False, True): f"be at least {low}"}
+            expected = ends.get((low is None, high is None), f"be at most {high}")
+            raise ValueError(f"{f.name} must {expected} {meta['unit']}".rstrip() + f", got {value}")
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,24 @@ class ParserSettings:
     fixed_objects: int = setting(-1, "parse exactly this many objects; -1 infers the number", low=-1, high=32)
     count_ratio: float = setting(0.1, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
     table: str = setting("auto", "where the table's plane comes from", choices=("auto", "pose", "depth"))
-    table_width: float = setting(1.2, "width of the table's prior area, along x of the table frame", unit="m", low=0.1)
-    table_depth: float = setting(1.2, "depth of the table's prior area, along y of the table frame", unit="m", low=0.1)
-    workspace_height: float = setting(0.5, "returns higher above the table are not parsed", unit="m", low=0.02)
-    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01)
-    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1)
-    score_width: int = setting(160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280)
+    table_width: float = setting(
+        1.2, "width of the table's prior area, along x of the table frame", unit="m", low=0.1, high=10.0
+    )
+    table_depth: float = setting(
+        1.2, "depth of the table's prior area, along y of the table frame", unit="m", low=0.1, high=10.0
+    )
+    workspace_height: float = setting(
+        0.5, "returns higher above the table are not parsed", unit="m", low=0.02, high=10.0
+    )
+    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
+    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
+    score_width: int = setting(
+        160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280
+    )
     window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
-    sigma_max: float = setting(0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4)
+    sigma_max: float = setting(
+        0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
+    )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(128, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)
