@@ -178,7 +178,9 @@ class FrameReader:
         matrix[:3, 3] = p.x, p.y, p.z
         quaternion = np.array([q.x, q.y, q.z, q.w])
         if not np.isfinite(matrix).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
-            raise BagError(f"{self.bag}: {self.pose_topic}: expected finite poses with unit quaternions, got {p}, {q}")
+            got = " ".join(f"{v:g}" for v in (p.x, p.y, p.z, *quaternion))
+            expected = "expected finite poses x y z qx qy qz qw with unit quaternions"
+            raise BagError(f"{self.bag}: {self.pose_topic}: {expected}, got {got}")
         matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         return matrix
 

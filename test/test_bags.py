@@ -265,7 +265,7 @@ def test_which_camera_pose(tmp_path):
         BagError, match="expected one camera_pose for /cam/depth/image_rect, the bag has /a/camera_pose"
     ):
         read("tie", ("/a/camera_pose", pose()), ("/b/camera_pose", pose()))
-    with pytest.raises(BagError, match="/camera_pose: expected finite poses with unit quaternions"):
+    with pytest.raises(BagError, match="/camera_pose: expected finite poses .* got 1 0 0 0 0 0 0"):
         read("zero", ("/camera_pose", pose(w=0.0)))
 
 

@@ -48,8 +48,10 @@ def load_scene(path: Path) -> Scene:
     """Read a scene. Raises SimulationError, one line naming the file, the key and what was expected."""
     try:
         content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError) as error:
-        raise SimulationError(f"{path}: expected a readable scene file: {error}") from None
+    except OSError as error:
+        raise SimulationError(f"{path}: expected a readable scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SimulationError(f"{path}: expected a scene file in yaml, this is no text") from None
     except yaml.YAMLError as error:
         raise SimulationError(f"{path}: expected yaml: {' '.join(str(error).split())}") from None
     try:
@@ -112,13 +114,20 @@ def _scene(path: Path, content: Any) -> Scene:
     height = _number(table.get("height", 0.75), "table.height")
     if not (size > 0).all() or height <= 0:
         raise ValueError(f"table: expected a size and a height > 0, got size {size.tolist()}, height {height}")
+    try:
+        intrinsics = Intrinsics(fx, fy, cx, cy, columns, rows)
+    except ValueError as error:
+        raise ValueError(f"camera.intrinsics: {error}") from None
+    cameras, start = _cameras(camera), round(_number(top.get("start", 1_700_000_000), "start"))
+    if start < 0 or start + len(cameras) / rate >= 2**31:
+        raise ValueError(f"start, rate: expected stamps from 0 to 2^31 seconds, got {start} s and {rate} Hz")
     return Scene(
         path=path,
         seed=_whole(top.get("seed", 0), "seed", 0),
         rate=rate,
-        start_ns=round(_number(top.get("start", 1_700_000_000), "start")) * 10**9,
-        intrinsics=Intrinsics(fx, fy, cx, cy, columns, rows),
-        cameras=_cameras(camera),
+        start_ns=start * 10**9,
+        intrinsics=intrinsics,
+        cameras=cameras,
         table_size=(size[0], size[1]),
         table_height=height,
         objects=tuple(_object(entry, f"objects[{i}]", path.parent) for i, entry in enumerate(objects)),
@@ -167,7 +176,10 @@ def _object(entry: Any, where: str, folder: Path) -> SceneObject:
     low, high = placed.min(0), placed.max(0)
     centre = _number(given.get("x", 0), f"{where}.x"), _number(given.get("y", 0), f"{where}.y")
     pose[:3, 3] = [centre[0] - (low[0] + high[0]) / 2, centre[1] - (low[1] + high[1]) / 2, -low[2]]
-    return SceneObject(str(given.get("name", Path(source).stem)), source, mesh, pose)
+    name = given.get("name", Path(source).stem)
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{where}.name: expected a text, got {name!r}")
+    return SceneObject(name, source, mesh, pose)
 
 
 def _mapping(value: Any, where: str, keys: tuple[str, ...]) -> dict[str, Any]:

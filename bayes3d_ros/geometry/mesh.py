@@ -42,6 +42,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh's loaders raise many kinds of errors, for every format its own
         reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, ImportError):  # a loader tries its luck as another format, and lacks a package for it
+            reason = f"damaged, or no {path.suffix} file"
         raise MeshError(f"{path}: cannot be read as a mesh ({reason[:200]})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeshError(f"{path}: holds no triangles")

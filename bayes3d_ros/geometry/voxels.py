@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface
+from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, scale_warning
 
 MAX_VOXELS = 2**25
 SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
@@ -36,14 +36,15 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     What can be reached from outside through voxels without a surface is free: the inside of a mug stays open, and
     gaps in the surface narrower than a voxel do not matter. Raises MeshError where the grid would be too large.
     """
-    if not voxel_size > 0:
-        raise MeshError(f"the voxel size must be positive, got {voxel_size} m")
+    if not 0 < voxel_size < np.inf:
+        raise MeshError(f"the voxel size must be positive and finite, got {voxel_size} m")
     low, high = mesh.bounds
     # The margin of 1/4 to 3/4 voxel keeps flat faces that lie along the grid away from the voxels' own faces.
     shape = np.ceil((high - low) / voxel_size + 0.5)
     if shape.prod() > MAX_VOXELS or mesh.area / voxel_size**2 > 1e6:
         size = " x ".join(f"{n:.0f}" for n in shape)
-        raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; choose larger voxels")
+        remedy = scale_warning(mesh) or "choose larger voxels"
+        raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; {remedy}")
     shape = shape.astype(int)
     origin = (low + high) / 2 - shape * voxel_size / 2
     samples = sample_surface(mesh, voxel_size / SAMPLES_PER_EDGE)

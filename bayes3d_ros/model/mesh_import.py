@@ -49,7 +49,10 @@ def import_meshes(
             model = model_from_mesh(mesh, path.stem, voxel_size, source=path.name)
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from error
-        yield ImportedMesh(path, save_model(model, folder), scale_warning(mesh))
+        warning = scale_warning(mesh)
+        if model.box_size.max() < 2 * voxel_size:
+            warning = f"the mesh is only {model.box_size.max():.2g} m long, less than two voxels of {voxel_size} m"
+        yield ImportedMesh(path, save_model(model, folder), warning)
 
 
 def model_from_mesh(

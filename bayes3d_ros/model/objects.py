@@ -167,7 +167,8 @@ def load_model(path: Path) -> ObjectModel:
     """Read a model file. Raises LibraryError with one line that names the file and what is wrong."""
     path = Path(path)
     if not path.is_file():
-        raise LibraryError(f"{path}: no such model file")
+        why = "expected a model file, this is a folder" if path.is_dir() else "no such model file"
+        raise LibraryError(f"{path}: {why}")
     try:
         if not zipfile.is_zipfile(path):
             raise ValueError("not a .npz file, or cut short")
@@ -240,7 +241,8 @@ def load_library(folder: Path) -> Library:
     """All models of a folder, sorted by name. Raises LibraryError with one line where one cannot be used."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise LibraryError(f"{folder}: no such library folder")
+        why = "expected a library folder, this is a file" if folder.exists() else "no such library folder"
+        raise LibraryError(f"{folder}: {why}")
     paths = sorted(path for path in folder.glob("*.npz") if not path.name.startswith("."))
     if not paths:
         raise LibraryError(f"{folder}: the library holds no models (*.npz)")

@@ -109,8 +109,16 @@ def test_voxel_size_must_be_positive(voxel):
 
 
 def test_a_grid_too_large_is_refused_before_it_is_made():
-    with pytest.raises(MeshError, match="choose larger voxels"):
+    with pytest.raises(MeshError, match="voxels; .*is this one in millimetres"):
         voxelize(trimesh.creation.box((100, 60, 40)), VOXEL)
+    with pytest.raises(MeshError, match="choose larger voxels"):
+        voxelize(trimesh.creation.box((0.1, 0.06, 0.04)), 1e-5)
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
+def test_a_voxel_size_that_is_none(size):
+    with pytest.raises(MeshError, match="must be positive and finite"):
+        voxelize(trimesh.creation.box((0.1, 0.06, 0.04)), size)
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.04])

@@ -160,5 +160,5 @@ def test_millimetres_are_reported_and_a_grid_too_large_is_named(tmp_path):
     (row,) = import_meshes([small], tmp_path / "library", 0.05)
     assert row.warning is not None and "millimetres" in row.warning
     large = write_box(tmp_path / "large.stl", (100, 60, 40))
-    with pytest.raises(MeshError, match=r"large\.stl: .*choose larger voxels"):
+    with pytest.raises(MeshError, match=r"large\.stl: .*millimetres"):
         list(import_meshes([large], tmp_path / "library", 0.003))

@@ -95,6 +95,12 @@ def test_missing_and_empty_libraries(tmp_path):
         load_library(tmp_path)
     with pytest.raises(LibraryError, match="no such model file"):
         load_model(tmp_path / "a.npz")
+    (tmp_path / "a.npz").mkdir()
+    with pytest.raises(LibraryError, match=r"a\.npz: expected a model file, this is a folder"):
+        load_library(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LibraryError, match="file: expected a library folder, this is a file"):
+        load_library(tmp_path / "file")
 
 
 def test_two_models_of_one_name(model, tmp_path):
