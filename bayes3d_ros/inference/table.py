@@ -21,7 +21,7 @@ _BELOW = 0.02  # metres below the plane that still count as the table
 
 
 class Plane(NamedTuple):
-    """Points x of the plane satisfy normal . x = distance in the camera frame; the normal points to the camera's side."""
+    """Points x of the plane satisfy normal . x = distance in the camera frame; the normal points to the origin."""
 
     normal: Float[np.ndarray, "3"]
     distance: float
@@ -83,7 +83,7 @@ def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5
 def table_frame(plane: Plane, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "4 4"]:
     """T_camera_table: z along the normal, origin where the optical axis meets the table, x to the camera's right.
 
-    Where the axis misses the table, or meets it far behind what is seen of it, the origin is the middle of what is seen.
+    Where the axis misses the table, or meets it far behind what is seen, the origin is the middle of what is seen.
     """
     z = plane.normal
     x = np.array([1.0, 0.0, 0.0]) - z[0] * z
@@ -110,13 +110,13 @@ def workspace(
     table_size: tuple[float, float],
     height: float,
 ) -> Int[np.ndarray, "H W"]:
-    """The kind of every pixel: IN_WORKSPACE if its return belongs to the table or to something that stands on it, BEYOND
+    """The kind of every pixel: IN_WORKSPACE if its return belongs to the table or to what stands on it, BEYOND
     if to something else, NO_RETURN where the point is NaN or, along the table's edge, where one cannot tell.
 
-    Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from the
-    plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what is seen
-    of the table's surface. (A chair behind the table touches its edge in the image, and a part of it may lean over.)
-    Raises ParseError where nothing of the table is seen.
+    Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from
+    the plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what
+    is seen of the table's surface. (A chair behind the table touches its edge in the image, and a part of it may lean
+    over.) Raises ParseError where nothing of the table is seen.
     """
     local = (points - T_camera_table[:3, 3]) @ T_camera_table[:3, :3]
     z_camera = points[..., 2]
@@ -162,8 +162,8 @@ def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> 
 
 
 def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> Delaunay | None:
-    """The convex hull of the largest connected piece of surface, grown by a margin, and reaching to below the camera: the
-    lower edge of the image is not the edge of the table."""
+    """The convex hull of the largest connected piece of surface, grown by a margin and reaching to below the camera:
+    the lower edge of the image is not the edge of the table."""
     if len(surface) < 50:
         return None
     low = surface.min(0)

@@ -1,6 +1,7 @@
 """A library as padded arrays: what compiled code sees. Shapes depend on padded sizes only, so that a library can
 gain an object without a recompilation."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,8 +21,8 @@ _TYPE_PAD, _VOXEL_PAD = 4, 1 << 16
 class LibraryArrays(NamedTuple):
     """K types (padded), V voxels of all grids laid end to end.
 
-    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8) and offset (int8); an empty voxel holds
-    zeros and the Chebyshev distance in voxels to the nearest surface voxel; a voxel inside the solid is all zeros.
+    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8) and offset (int8); an empty voxel
+    holds zeros and the Chebyshev distance in voxels to the nearest surface voxel; one inside the solid is all zeros.
     """
 
     num_types: Int[Array, ""]
@@ -87,8 +88,8 @@ def library_arrays(library: Library) -> LibraryArrays:
     words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
     words[: first[-1]] = np.concatenate(grids)
 
-    def stack(rows: list[np.ndarray], dtype: type = np.float32) -> Array:
-        rows = rows + [rows[0]] * (padded - count)
+    def stack(rows: Sequence[np.ndarray | np.floating], dtype: type = np.float32) -> Array:
+        rows = [*rows, *[rows[0]] * (padded - count)]
         return jnp.asarray(np.stack(rows).astype(dtype))
 
     return LibraryArrays(

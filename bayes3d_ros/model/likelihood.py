@@ -1,16 +1,16 @@
 """The likelihood of a depth image, given which pixels returned (the mask is taken as given).
 
-For a return z at a pixel with ray r (r_z = 1), and rendered points y_j r_j in the pixel's window at distance d_j from its
-ray,
+For a return z at a pixel with ray r (r_z = 1), and rendered points y_j r_j in the pixel's window at distance d_j from
+its ray,
 
     p_out a(z) + (1 - p_out) sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),   w_j ~ exp(-d_j^2 / 2 sigma^2),
 
-with the w_j normalised over the window's surface points and a(z) = 3 z^2 / (far^3 - near^3), the density of depth uniform
-in the frustum's volume. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's ray, so that it is a density of the
-depth image and integrates to one over z for every scene. Where the window holds no surface, the density is a(z).
+with the w_j normalised over the window's surface points and a(z) = 3 z^2 / (far^3 - near^3), the density of depth
+uniform in the frustum's volume. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's ray, so that it is a density
+of the depth image and integrates to one over z for every scene. Where the window holds no surface, the density is a(z).
 
-A return beyond the workspace (floor, wall, robot) is free-space evidence: where the scene puts a surface in front of it, it
-is an outlier, p_out a(z); elsewhere it has the scene-independent density a(z).
+A return beyond the workspace (floor, wall, robot) is free-space evidence: where the scene puts a surface in front of
+it, it is an outlier, p_out a(z); elsewhere it has the scene-independent density a(z).
 
 Arrays are [rows, columns, tiles]: tiles come last, so that every operation runs along them.
 """
@@ -106,7 +106,7 @@ def _sum_log(
     p = p[None, :, None]
 
     def four(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
-        product = 1.0
+        product: Array | float = 1.0
         for m in range(4):
             product *= p * outlier[4 * k + m] + (1 - p) * inlier[:, None, 4 * k + m]
         return total + jnp.log(product)

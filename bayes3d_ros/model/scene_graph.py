@@ -28,7 +28,8 @@ class Table(NamedTuple):
 
 def T_table_object(contact: Contact, library: LibraryArrays) -> Float[Array, "*batch 4 4"]:
     """The pose that a contact stands for: Trans(x, y, 0) Rot_z(yaw) T_contact_object."""
-    c, s, zero, one = jnp.cos(contact.yaw), jnp.sin(contact.yaw), jnp.zeros_like(contact.yaw), jnp.ones_like(contact.yaw)
+    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
+    zero, one = jnp.zeros_like(contact.yaw), jnp.ones_like(contact.yaw)
     slide = jnp.stack(
         [
             jnp.stack([c, -s, zero, contact.x], -1),
@@ -60,7 +61,7 @@ def log_prior(contact: Contact, library: LibraryArrays, table: Table) -> Float[A
 def overlap(
     a: Contact, b: Contact, library: LibraryArrays
 ) -> Float[Array, "*batch"]:
-    """How much two solids interpenetrate: the share of the points spread in one that lie in the other, the larger way."""
+    """How much two solids interpenetrate: of points spread in one the share that lies in the other, the larger way."""
     T_a, T_b = T_table_object(a, library), T_table_object(b, library)
     return jnp.maximum(_share_inside(a, T_a, b, T_b, library), _share_inside(b, T_b, a, T_a, library))
 

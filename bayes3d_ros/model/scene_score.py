@@ -1,7 +1,7 @@
 """Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change.
 
-The image region of each hypothesis is cut into tiles; tiles of all hypotheses form one list, worked through in chunks of
-static shape, as many as it takes. Cost grows with the pixels that hypotheses cover and no N x H x W image is made.
+The image region of each hypothesis is cut into tiles; tiles of all hypotheses form one list, worked through in chunks
+of static shape, as many as it takes. Cost grows with the pixels that hypotheses cover and no N x H x W image is made.
 """
 
 from typing import NamedTuple

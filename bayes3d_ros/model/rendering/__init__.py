@@ -1,4 +1,4 @@
-"""Depth of voxel models along rays. `renderers` is the one table of backends; `reference` is what they are tested against."""
+"""Depth of voxel models along rays. `renderers` is the one table of backends; `reference` is what tests trust."""
 
 from collections.abc import Callable
 

@@ -1,12 +1,13 @@
 """The fast renderer: walk each ray through the voxel grid, skipping empty space, to the first plane it meets.
 
-What is rendered (the reference renders the same): a surface voxel is hit where the ray, having entered the voxel's cube,
-meets the voxel's plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
+What is rendered (the reference renders the same): a surface voxel is hit where the ray, having entered its cube, meets
+its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
 Most rays end within a few steps and a few graze on for dozens: after the first steps those left are packed together.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -70,11 +71,11 @@ def march(
         flat(leave),
     )
     t, hit = flat(start), jnp.full(walk.leave.shape, NO_SURFACE)
-    t, hit = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, s: _advance(library.words, walk, *s, near), (t, hit))
+    t, hit = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, s: _advance(library.words, walk, s[0], s[1], near), (t, hit))
     return _finish(library.words, walk, t, hit, near).reshape(shape)
 
 
-def _nudge(d: list[Array]) -> Array:
+def _nudge(d: Sequence[Array]) -> Array:
     return _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
 
 
@@ -107,7 +108,7 @@ def _byte(words: Int[Array, "N"], shift: int) -> Float[Array, "N"]:
 
 
 def _advance(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> tuple[Array, Array]:
-    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray that is done has t = inf."""
+    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray is done at t = inf."""
     o, d, dims = walk.origin, walk.direction, walk.dims
     active = t < walk.leave
     at = jnp.where(active, t, 0.0)
