@@ -46,12 +46,12 @@ class ScenePosterior:
     sigma: float
     log_evidence: float  # log Bayes factor against the empty table
     samples: SceneSamples
+    object_index: Int[np.ndarray, "S M"]  # which of `objects` each sample's object is; larger: not listed; -1: none
     reconstruction: Float[np.ndarray, "height width"]  # metres, NaN where no surface; the size of the input
     segmentation: Int[np.ndarray, "height width"]  # uint16, 0 = no object
     T_camera_table: Float[np.ndarray, "4 4"]
     ess: tuple[float, ...]  # effective sample size before resampling, as a fraction, of every stage
     seconds: float
-    object_index: Int[np.ndarray, "S M"] | None = None  # which of `objects` each sample's object is (summaries.Summary)
     notes: tuple[str, ...] = field(default=())  # what a user should know of this frame, one line each
 
 

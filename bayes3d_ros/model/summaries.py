@@ -86,6 +86,15 @@ def summarise(
     )
 
 
+def object_estimates(
+    samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], count: int
+) -> tuple[ObjectEstimate, ...]:
+    """What the samples say of objects 0 .. count - 1, given which object every slot holds."""
+    weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
+    weights /= weights.sum()
+    return tuple(_estimate(samples, weights, object_index == k, types) for k in range(count))
+
+
 def posterior_rows(samples: SceneSamples, object_index: Int[np.ndarray, "S M"]) -> np.ndarray:
     """The posterior as a table (fields POSTERIOR_FIELDS): a row per object per sample, in order of samples.
 

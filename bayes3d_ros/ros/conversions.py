@@ -121,8 +121,6 @@ def reconstruction_image(posterior: ScenePosterior) -> Image:
 
 def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
     """A point per object per sample; a sample without objects is one point with object = -1 (model/summaries.py)."""
-    if posterior.object_index is None:
-        raise ValueError("posterior: expected object_index, it says which object of a sample is which")
     return cloud_message(posterior_rows(posterior.samples, posterior.object_index), header(posterior))
 
 

@@ -7,7 +7,7 @@ from sensor_msgs.msg import Image
 
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
-from bayes3d_ros.model.summaries import summarise
+from bayes3d_ros.model.summaries import object_estimates
 from bayes3d_ros.ros.conversions import depth_from_image, rows_from_cloud, stamp_to_ns
 
 
@@ -17,23 +17,26 @@ def stamp_of(message: Any) -> int:
     return stamp_to_ns(header.stamp)
 
 
-def samples_from_rows(rows: np.ndarray) -> SceneSamples:
-    """Weighted scenes from the rows of ~/posterior; an object's slot is its place among its sample's rows."""
+def samples_from_rows(rows: np.ndarray) -> tuple[SceneSamples, np.ndarray]:
+    """Weighted scenes, and which object every slot holds, from the rows of ~/posterior.
+
+    An object's slot is its place among its sample's rows.
+    """
     sample, first, size = np.unique(rows["sample"], return_index=True, return_counts=True)
     count, most = len(sample), int(max(rows["n"].max(initial=0), 1))
-    index = np.repeat(np.arange(count), size)
     slot = np.arange(len(rows)) - np.repeat(first, size)  # rows are in the order of samples
-    kind, face = np.full((count, most), -1), np.full((count, most), -1)
+    kind, face, index = (np.full((count, most), -1) for _ in range(3))
     position, orientation = np.zeros((count, most, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, most, 1))
     held = rows["object"] >= 0
-    where = index[held], slot[held]
-    kind[where], face[where] = rows["type"][held], rows["face"][held]
+    where = np.repeat(np.arange(count), size)[held], slot[held]
+    kind[where], face[where], index[where] = rows["type"][held], rows["face"][held], rows["object"][held]
     position[where] = np.stack([rows[name][held] for name in ("x", "y", "z")], -1)
     orientation[where] = np.stack([rows[name][held] for name in ("qx", "qy", "qz", "qw")], -1)
     per_sample = {name: rows[name][first] for name in ("log_weight", "p_outlier", "sigma")}
-    return SceneSamples(
+    samples = SceneSamples(
         num_objects=rows["n"][first], type=kind, face=face, position=position, orientation=orientation, **per_sample
     )
+    return samples, index
 
 
 def labels_from_image(image: Image) -> np.ndarray:
@@ -47,21 +50,21 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     The table's pose is not published: T_camera_table is NaN.
     """
     cloud = messages["posterior"]
-    samples = samples_from_rows(rows_from_cloud(cloud))
-    summary = summarise(samples, library.names, 0.5, library)
+    samples, object_index = samples_from_rows(rows_from_cloud(cloud))
+    weights = np.exp(samples.log_weight.astype(float))
     scene = messages["summary"].status[0]
     values = {pair.key: pair.value for pair in scene.values}
     return ScenePosterior(
         stamp_ns=stamp_of(cloud),
         frame_id=cloud.header.frame_id,
         types=library.names,
-        objects=summary.objects[: len(messages["poses"].poses)],
-        num_objects=summary.num_objects,
-        p_outlier=summary.p_outlier,
-        sigma=summary.sigma,
+        objects=object_estimates(samples, object_index, library.names, len(messages["poses"].poses)),
+        num_objects={n: float(weights[samples.num_objects == n].sum()) for n in range(samples.num_objects.max() + 1)},
+        p_outlier=float(weights @ samples.p_outlier),
+        sigma=float(weights @ samples.sigma),
         log_evidence=float(values["log evidence"]),
         samples=samples,
-        object_index=summary.object_index,
+        object_index=object_index,
         reconstruction=depth_from_image(messages["depth_reconstruction"]),
         segmentation=labels_from_image(messages["segmentation"]),
         T_camera_table=np.full((4, 4), np.nan),

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from bayes3d_ros.model.summaries import posterior_rows
 from bayes3d_ros.ros import conversions
@@ -8,10 +9,11 @@ from bayes3d_ros.ros.summary import summary_message
 
 def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
     posterior = fake_posterior(depth_frame(), library.names)
-    samples = samples_from_rows(posterior_rows(posterior.samples, posterior.object_index))
+    samples, index = samples_from_rows(posterior_rows(posterior.samples, posterior.object_index))
     most = samples.type.shape[1]
     for name in ("type", "face"):
         np.testing.assert_array_equal(getattr(samples, name), getattr(posterior.samples, name)[:, :most])
+    np.testing.assert_array_equal(index, posterior.object_index[:, :most])
     held = samples.type >= 0
     for name in ("position", "orientation"):
         expected = getattr(posterior.samples, name)[:, :most]
@@ -34,8 +36,11 @@ def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library)
     assert [o.type for o in again.objects] == [o.type for o in posterior.objects]
     for mine, other in zip(again.objects, posterior.objects, strict=True):
         np.testing.assert_allclose(mine.position, other.position, atol=1e-5)
+        np.testing.assert_allclose(mine.probability, other.probability, atol=1e-5)
         np.testing.assert_allclose(mine.covariance, other.covariance, atol=1e-7)
     np.testing.assert_array_equal(again.segmentation, posterior.segmentation)
     np.testing.assert_allclose(again.reconstruction, posterior.reconstruction)
-    assert again.num_objects.keys() == posterior.num_objects.keys()
+    np.testing.assert_array_equal(again.object_index, posterior.object_index[:, : again.object_index.shape[1]])
+    assert again.num_objects == pytest.approx(posterior.num_objects)
+    assert (again.p_outlier, again.sigma) == pytest.approx((posterior.p_outlier, posterior.sigma))
     assert again.notes == posterior.notes and again.seconds == posterior.seconds
