@@ -147,9 +147,8 @@ def _samples_panel(
             axis.scatter(seen[:, 0], seen[:, 1], s=3, color=colour(label), alpha=0.12, linewidths=0)
             centres = np.concatenate([centres, seen[np.isfinite(seen).all(1), :2]])  # keeps them in view
     owner = np.full(len(sample), -1)
-    if posterior.object_index is not None:
-        for k, found in enumerate(posterior.objects):
-            owner[(posterior.object_index[sample, slot] == k) & (kind == posterior.types.index(found.type))] = k
+    for k, found in enumerate(posterior.objects):
+        owner[(posterior.object_index[sample, slot] == k) & (kind == posterior.types.index(found.type))] = k
     for k in range(-1, len(posterior.objects)):
         own = owner == k
         if own.any():
@@ -166,12 +165,14 @@ def _samples_panel(
     middle = (around.min(0) + around.max(0)) / 2
     half = max(float((around.max(0) - around.min(0)).max()) / 2 * 1.25, 0.1)
     axis.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]), aspect="equal")
+    axis.locator_params(nbins=5)
     axis.grid(color="#e6e6e6", linewidth=0.7)
     axis.set_axisbelow(True)
     axis.tick_params(labelsize=8, colors=INK)
     axis.set_xlabel("x on the table, m", fontsize=9, color=INK)
     axis.set_ylabel("y on the table, m", fontsize=9, color=INK)
-    axis.set_title("posterior samples from above (dot: object origin, x: not listed)", fontsize=10, color=INK)
+    what = "samples from above (dots: objects' origins; pale: surfaces seen; x: not listed)"
+    axis.set_title(what, fontsize=9, color=INK)
 
 
 def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
@@ -214,7 +215,12 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
 def _spread(found: ObjectEstimate) -> str:
     place = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
     turn = np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:])))
-    return f"{place:.1f} mm  {turn:.1f}°"
+    return f"{_short(place)} mm  {_short(turn)}°"
+
+
+def _short(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.2g}" if 0.01 <= value < 99.5 else f"{value:.0f}" if value >= 99.5 else "<0.01"
 
 
 def _shorten(text: str, length: int) -> str:

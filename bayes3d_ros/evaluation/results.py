@@ -4,6 +4,7 @@ import json
 import os
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -63,13 +64,14 @@ class ResultsWriter:
     def __init__(self, folder: Path, types: Sequence[str]) -> None:
         self.folder, self.types = Path(folder), tuple(types)
         self.frames = 0
+        self._stamps: Counter[int] = Counter()
 
     def __enter__(self) -> "ResultsWriter":
         try:
             (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
             if (self.folder / SCENES).exists():  # an earlier run's frames would look like this one's
                 for path in (self.folder / FRAMES).iterdir():
-                    if re.fullmatch(r"\d+\.(npz|png)", path.name):
+                    if re.fullmatch(r"-?\d+(_\d+)?\.(npz|png)", path.name):
                         path.unlink()
                 (self.folder / SAMPLES).unlink(missing_ok=True)
             self._scenes = (self.folder / SCENES).open("w")
@@ -80,10 +82,8 @@ class ResultsWriter:
 
     def write(self, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Path:
         """Append a frame; depth is what was parsed, in metres. Returns where the frame's PNG belongs."""
-        if posterior.object_index is None:
-            raise ValueError("posterior.object_index is needed to write samples")
         try:
-            path = self.folder / FRAMES / f"{posterior.stamp_ns}.npz"
+            path = self.folder / FRAMES / f"{self._frame_name(posterior.stamp_ns)}.npz"
             temporary = path.with_name(f".{path.name}.tmp")
             with temporary.open("wb") as file:
                 np.savez_compressed(
@@ -105,6 +105,12 @@ class ResultsWriter:
             raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
         self.frames += 1
         return path.with_suffix(".png")
+
+    def _frame_name(self, stamp_ns: int) -> str:
+        """The stamp; STAMP_2, STAMP_3, ... where a recording repeats it, so that no frame replaces another."""
+        self._stamps[stamp_ns] += 1
+        count = self._stamps[stamp_ns]
+        return f"{stamp_ns}" if count == 1 else f"{stamp_ns}_{count}"
 
     def __exit__(self, *error: Any) -> None:
         self._scenes.close()

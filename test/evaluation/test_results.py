@@ -67,6 +67,16 @@ def test_frames_hold_the_images(written):
         assert arrays["reconstruction"].dtype == np.float32 and arrays["segmentation"].dtype == np.uint16
 
 
+def test_frames_of_one_stamp_do_not_replace_each_other(depth_frame, fake_posterior, tmp_path):
+    with ResultsWriter(tmp_path, TYPES) as results:
+        paths = [results.write(depth_frame(s).depth, fake_posterior(depth_frame(s), TYPES)) for s in (0, 0, 5, 0)]
+    assert [path.stem for path in paths] == ["0", "0_2", "5", "0_3"]
+    assert all(path.with_suffix(".npz").is_file() for path in paths)
+    with ResultsWriter(tmp_path, TYPES):
+        pass
+    assert list((tmp_path / "frames").iterdir()) == []
+
+
 def test_the_same_posteriors_give_the_same_bytes(written, tmp_path):
     folder, pairs = written
     with ResultsWriter(tmp_path / "again", TYPES) as results:
