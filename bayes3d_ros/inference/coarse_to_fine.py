@@ -9,7 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.alignment import align
-from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, wrap
+from bayes3d_ros.inference.mixture import (
+    SHARES,
+    SHARES_WITHOUT_MODES,
+    Modes,
+    Proposal,
+    draw_modes,
+    log_density_modes,
+    refit,
+    wrap,
+)
+from bayes3d_ros.inference.noise import NoiseGrid, peak
+from bayes3d_ros.inference.resampling import effective_fraction
 from bayes3d_ros.inference.sketch_search import (
     YAWS,
     Evidence,
@@ -25,10 +36,11 @@ from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
 from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
 
 T = TypeVar("T")
-_GLOBAL, _CANDIDATES = 128, 32
+_GLOBAL, _QUARTERS, _CANDIDATES = 64, 4, 32
 _MODES, _DRAWS, _ROUNDS = 8, 20, 4
-_FINALISTS, _LEADERS = 4, 2
-_FIT_ALL, _FIT_LEADERS = (20, 2), (40, 2)  # draws a mode, rounds
+_FINALISTS = 4
+_FIT_ALL, _FIT_LAST = (20, 2), (24, 1)  # draws a mode, rounds
+_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 5, 96, 0.25
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _WORTH = 5.0  # nats: below, no candidate is worth a search
@@ -37,9 +49,10 @@ _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)
 
 
 class Scene(NamedTuple):
-    """A scene that stands for the population: its depth image, and its objects."""
+    """A scene that stands for the population: its depth image, its log likelihood on the grid of noise, its objects."""
 
     depth: Float[Array, "Hp Wp"]  # padded
+    table: Float[Array, "S P"]
     objects: Contact  # [M]
     count: Int[Array, ""]
 
@@ -108,16 +121,19 @@ def candidates(
     centres, count = cells_to_search(evidence, image, table, shape)
     scores = score_cells(centres, count, evidence, image, library, table)
     kinds = scores.shape[1]
-    # The best overall, and the best of every type and face: no type is shut out by a crowd of another.
-    best, index = jax.lax.top_k(scores.max(-1).ravel(), _GLOBAL)
+    # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
+    # score flat in yaw); and the best of every type and face: no type is shut out by a crowd of another.
+    _, index = jax.lax.top_k(scores.max(-1).ravel(), _GLOBAL)
     per_face = scores.transpose(1, 2, 0, 3).reshape(kinds * NUM_FACES, -1)
     cell, kind, face = index // (kinds * NUM_FACES), index // NUM_FACES % kinds, index % NUM_FACES
+    quarter = jnp.argmax(scores[cell, kind, face].reshape(_GLOBAL, _QUARTERS, -1), -1)
+    quarter = quarter + jnp.arange(_QUARTERS) * (YAWS // _QUARTERS)
     first = jnp.argmax(per_face, 1)
-    yaw = jnp.concatenate([jnp.argmax(scores[cell, kind, face], -1), first % YAWS])
-    cell = jnp.concatenate([cell, first // YAWS])
-    kind = jnp.concatenate([kind, jnp.repeat(jnp.arange(kinds), NUM_FACES)])
-    face = jnp.concatenate([face, jnp.tile(jnp.arange(NUM_FACES), kinds)])
-    coarse = jnp.concatenate([best, per_face.max(1)])
+    yaw = jnp.concatenate([quarter.ravel(), first % YAWS])
+    cell = jnp.concatenate([jnp.repeat(cell, _QUARTERS), first // YAWS])
+    kind = jnp.concatenate([jnp.repeat(kind, _QUARTERS), jnp.repeat(jnp.arange(kinds), NUM_FACES)])
+    face = jnp.concatenate([jnp.repeat(face, _QUARTERS), jnp.tile(jnp.arange(NUM_FACES), kinds)])
+    coarse = scores[cell, kind, face, yaw]
     contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
     contact, information = align(contact, evidence, image, library, table)
     loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
@@ -241,17 +257,44 @@ def sharpen(
     return modes, values[-1]
 
 
+def adapt(
+    key: PRNGKeyArray, modes: Modes, gains: Callable, library: LibraryArrays, table: Table
+) -> Modes:
+    """Refit the mixture to weighted draws from itself until their weights are even enough. The draws are thrown away:
+    the sampler's own come after, so that nothing is chosen by its weight."""
+
+    def unfit(state: tuple) -> Array:
+        trial, ess, _, _ = state
+        return (trial < _PILOT_ROUNDS) & (ess < _PILOT_ESS)
+
+    def pilot(state: tuple) -> tuple:
+        trial, _, modes, key = state
+        key, draw_key = jax.random.split(key)
+        draws = draw_modes(draw_key, modes, _PILOT_DRAWS)
+        log_weight = gains(draws) + log_prior(draws, library, table)
+        log_weight -= jax.nn.logsumexp(log_density_modes(draws, modes), 1)
+        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
+        ess = effective_fraction(log_weight)
+        weight = _temper(log_weight[None], _PILOT_ESS * _PILOT_DRAWS)[0]
+        fitted = refit(draws, weight, modes)
+        kept = jax.tree.map(lambda new, old: jnp.where(ess < _PILOT_ESS, new, old), fitted, modes)
+        return trial + 1, ess, kept, key
+
+    return jax.lax.while_loop(unfit, pilot, (0, jnp.float32(0.0), modes, key))[2]
+
+
 def find_proposal(
     key: PRNGKeyArray,
     scene: Scene,
     context: Context,
-    noise: Noise,
+    grid: NoiseGrid,
     table_size: tuple[float, float],
     window: int,
     overlap_limit: float,
 ) -> Proposal:
     """The proposal for one more object, given the scene that stands for the population."""
     image, library, table = context
+    noise = peak(scene.table, grid)
     height, width = image.depth.shape
     half = window // 2
     shape = cell_grid(table_size)
@@ -265,32 +308,42 @@ def find_proposal(
     def rough(contact: Contact) -> Float[Array, "N"]:
         return 4 * _gains(contact, small_depth, small, noise, window)
 
-    def exact(contact: Contact) -> Float[Array, "N"]:
+    def exact(contact: Contact, noise: Noise = noise) -> Float[Array, "N"]:
         return _gains(contact, scene.depth, context, noise, window)
+
+    def noise_with(contact: Contact) -> Noise:
+        """The noise level once the first of these objects explains what it does."""
+        first = _take(contact, slice(1))
+        gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
+        return peak(scene.table + gain[0], grid)
 
     found, gain = _sorted(found, jnp.where(jnp.isfinite(score), rough(found.contact), -jnp.inf), _CANDIDATES)
     found, gain = _sorted(found, _distinct(found.contact, gain, (0.004, 0.05)), _MODES)
     worth = gain[0] > _WORTH
+    search_key, adapt_key = jax.random.split(key)
 
-    def search() -> tuple[Hypotheses, Float[Array, "M"]]:
-        narrow_key, first_key, last_key = jax.random.split(key, 3)
+    def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
+        scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
+        log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
+        # Flattened: the gains are rough, and a mode that is missed costs more than one that is tried in vain.
+        log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
+        return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / _FINALISTS))))
+
+    def search() -> Modes:
+        narrow_key, first_key, last_key = jax.random.split(search_key, 3)
         modes = narrow(narrow_key, found, rough)
         modes, _ = _sorted(modes, rough(modes.contact), _FINALISTS)
         modes, value = sharpen(first_key, modes, exact, *_FIT_ALL)
-        # The leaders once more, with more draws: the posterior is mostly theirs.
+        # Once more, at the noise level of a scene that holds the best of them.
         modes, value = _sorted(modes, value, _FINALISTS)
-        led = sharpen(last_key, _take(modes, slice(_LEADERS)), exact, *_FIT_LEADERS)
-        return jax.tree.map(lambda best, all_: jnp.concatenate([best, all_[_LEADERS:]]), led, (modes, value))
+        lower = noise_with(modes.contact)
+        modes, value = sharpen(last_key, modes, lambda c: exact(c, lower), *_FIT_LAST)
+        return adapt(adapt_key, as_mixture(modes, value), lambda c: exact(c, lower), library, table)
 
-    def nothing() -> tuple[Hypotheses, Float[Array, "M"]]:
-        return _take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS)
+    def nothing() -> Modes:
+        return as_mixture(_take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))
 
-    modes, value = jax.lax.cond(worth, search, nothing)
-    scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
-    log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
-    # Flattened: the gains are rough, and a mode that is missed costs more than one that is tried in vain.
-    log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
-    log_weight = jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / _FINALISTS)))
+    mixture = jax.lax.cond(worth, search, nothing)
     cells = hidden_cells(image, table, shape)
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
-    return Proposal(Modes(modes.contact, scale, log_weight), cells / cells.sum(), shares)
+    return Proposal(mixture, cells / cells.sum(), shares)

@@ -14,9 +14,9 @@ from scipy.interpolate import CubicSpline
 
 from bayes3d_ros.model.likelihood import Noise
 
-_SIGMA_STEPS, _P_STEPS = 11, 12  # coarse grid: sigma_max 2^(-k/3), logit p
+_SIGMA_STEPS, _P_STEPS = 11, 13  # coarse grid: sigma_max 2^(-k/3), logit p
 _SIGMA_FINE, _P_FINE = 16, 16  # fine points between coarse ones
-_P_LOW, _P_HIGH = 1e-3, 0.9
+_P_LOW, _P_HIGH = 2e-4, 0.9
 
 
 class NoiseGrid(NamedTuple):

@@ -91,9 +91,8 @@ def step(
     state = jax.tree.map(lambda a: a[kept] if a.ndim else a, state)._replace(log_weight=log_weight)
 
     lead = jnp.argmax(log_weight + 1e-3 * state.log_likelihood)
-    scene = Scene(state.scenes[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
-    noise = noise_model.peak(state.table[lead], grid)
-    proposal = find_proposal(search_key, scene, context, noise, table_size, window, OVERLAP_LIMIT)
+    scene = Scene(state.scenes[lead], state.table[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
+    proposal = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
     new = propose(draw_key, proposal, particles, context.library, context.table)
     log_q = log_density(new, proposal, context.library, context.table)
 
