@@ -15,7 +15,7 @@ from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.model.scene_graph import Contact, Table
 
 _DEGREES_OF_FREEDOM = 4.0
-# Shares of the proposal: the modes, where something could hide, anywhere. Without modes worth trying the floor has it all.
+# Shares of the proposal: the modes, where something could hide, anywhere. Without modes worth trying, all is floor.
 SHARES, SHARES_WITHOUT_MODES = (0.84, 0.12, 0.04), (0.0, 0.7, 0.3)
 
 

@@ -1,7 +1,7 @@
 """Noise variables are marginalised numerically: log likelihoods on a coarse grid, splines between, a fine sum.
 
-The log likelihood of a scene is smooth in (log sigma, logit p_outlier) and its peak is narrow: tens of pixels make a coarse
-grid exact enough to interpolate, thousands make it useless to sum.
+The log likelihood of a scene is smooth in (log sigma, logit p_outlier) but its peak is narrow: a coarse grid is enough
+to interpolate, and far too coarse to sum.
 """
 
 from typing import NamedTuple

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, unproject
@@ -19,9 +19,9 @@ from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ParseError, SceneSamples, ScenePosterior
+from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.model.rendering import renderers
-from bayes3d_ros.model.scene_graph import Contact, Table, T_camera_object
+from bayes3d_ros.model.scene_graph import Contact, Table
 from bayes3d_ros.model.scene_score import Image
 from bayes3d_ros.model.summaries import summarise
 
@@ -173,25 +173,27 @@ class SceneParser:
 
     def _keep(self, key: PRNGKeyArray, state: smc.State) -> _Stage:
         noise = self._sample_noise(key, state.table, self._grid)
-        return jax.device_get(
-            _Stage(state.objects, state.log_weight, noise.p_outlier, noise.sigma, state.log_evidence)
+        objects, log_weight, noise, log_evidence = jax.device_get(
+            (state.objects, state.log_weight, noise, state.log_evidence)
         )
+        return _Stage(objects, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
 
     def _mix(self, stages: list[_Stage], table: Table) -> tuple[SceneSamples, float]:
-        """The mixture over the number of objects, p(n | image) ~ P(n) Z_n; and log p(image) / p(image | empty table)."""
-        counts = np.arange(len(stages)) if self.settings.fixed_objects < 0 else [self.settings.fixed_objects]
-        log_prior = np.asarray(counts) * np.log(self.settings.count_ratio)
-        if self.settings.fixed_objects < 0:
-            log_prior -= np.logaddexp.reduce(np.arange(self.settings.max_objects + 1) * np.log(self.settings.count_ratio))
+        """The mixture over the number of objects, p(n | image) ~ P(n) Z_n, and log p(image) - log p(image | empty)."""
+        settings = self.settings
+        if settings.fixed_objects < 0:
+            counts = np.arange(len(stages))
+            possible = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
+            log_prior = possible[: len(stages)] - np.logaddexp.reduce(possible)
         else:
-            log_prior = np.zeros(1)
-        log_z = np.array([float(s.log_evidence) for s in stages])
+            counts, log_prior = np.array([settings.fixed_objects]), np.zeros(1)
+        log_z = np.array([s.log_evidence for s in stages])
         log_evidence = np.logaddexp.reduce(log_prior + log_z)
         log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
         log_weight -= np.logaddexp.reduce(log_weight)
         n = np.repeat(counts, [len(s.log_weight) for s in stages])
         keep = log_weight > -30
-        objects = Contact(*(np.concatenate(parts)[keep] for parts in zip(*(s.objects for s in stages), strict=True)))
+        objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
         held = np.arange(objects.type.shape[1]) < n[keep, None]
         T = np.asarray(self._poses(objects, table))
         quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)

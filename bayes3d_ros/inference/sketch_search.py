@@ -1,8 +1,8 @@
 """The coarse level: score every (type, face, yaw, x, y) cell with a sketch of the object, a few points of its surface.
 
 A sketch point is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;
-where the camera sees past it, against; where something hides it, or nothing returned, it says nothing. Scores only choose
-where to look closer: they need not be right, and the sampler's weights are exact whatever they are.
+where the camera sees past it, against; where something hides it, or nothing returned, it says nothing. Scores only
+choose where to look closer: they need not be right, and the sampler's weights are exact whatever they are.
 """
 
 from typing import NamedTuple
@@ -20,9 +20,8 @@ CELL = 0.02  # metres
 YAWS = 24
 MAX_CELLS = 512
 _BLOCK = 4  # cells a step
-_COARSE_POINTS = 36
 # Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
-_COARSE_TOLERANCE, _COARSE_PENALTY = 0.02, 0.25
+_COARSE = (0.02, 0.25, 36)  # tolerance, penalty, points
 _REACH = 3  # cells: how far from unexplained returns an object's centre is looked for
 _NATS = 8.0  # what a pixel explained is worth, roughly
 
@@ -129,7 +128,7 @@ def score_cells(
             y=jnp.repeat(xy[:, 1], per_cell),
             yaw=jnp.tile((yaw + 0.5) * (2 * jnp.pi / YAWS), _BLOCK),
         )
-        value = sketch_score(contact, evidence, image, library, table, _COARSE_TOLERANCE, _COARSE_PENALTY, _COARSE_POINTS)
+        value = sketch_score(contact, evidence, image, library, table, *_COARSE)
         value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
         return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
 

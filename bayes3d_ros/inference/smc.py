@@ -1,9 +1,9 @@
 """Sequential Monte Carlo over the objects of a scene (Bayes3D, Methodology, B), with the paper's gaps closed.
 
-Stage k carries weighted scenes of k objects towards p_k, the posterior given k objects. The noise variables are integrated
-out of every target (`noise.py`), so none is replaced between stages and W_i needs no kernel for them. Scenes are sets: a
-set of k objects has k! orders, the sampler makes one of them, and the backward kernel says which object came last. It
-prefers the one that covers the fewest pixels on its own, since the search adds what explains most first.
+Stage k carries weighted scenes of k objects towards p_k, the posterior given k objects. The noise variables are
+integrated out of every target (`noise.py`), so none is replaced between stages and W_i needs no kernel for them. Scenes
+are sets: a set of k objects has k! orders, the sampler makes one of them, and the backward kernel says which object
+came last. It prefers the one that covers the fewest pixels on its own, since the search adds what explains most first.
 """
 
 from functools import partial

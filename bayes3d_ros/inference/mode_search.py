@@ -1,0 +1,167 @@
+"""The fine levels: follow modes of the likelihood uphill, learn their shapes, and make a mixture that fits."""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes, refit
+from bayes3d_ros.inference.resampling import effective_fraction
+from bayes3d_ros.model.library_arrays import LibraryArrays
+from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
+
+Tree = TypeVar("Tree")
+_DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
+_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 5, 96, 0.25
+_INFLATION, _FLATTEN = 1.5, 4.0
+_SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
+
+
+class Hypotheses(NamedTuple):
+    """Objects, with how far off in (x, y, yaw) each may be."""
+
+    contact: Contact  # [N]
+    covariance: Float[Array, "N 3 3"]
+
+
+def take(tree: Tree, index: Array | slice) -> Tree:
+    return jax.tree.map(lambda a: a[index], tree)
+
+
+def best_first(tree: Tree, score: Float[Array, "N"], count: int) -> tuple[Tree, Float[Array, "count"]]:
+    best, index = jax.lax.top_k(score, count)
+    return take(tree, index), best
+
+
+def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M D"]:
+    """Weights exp(beta v), normalised along the last axis, with beta <= 1 as large as keeps `effective` samples."""
+
+    def weights(beta: Float[Array, "M"]) -> Float[Array, "M D"]:
+        return jax.nn.softmax(beta[:, None] * log_value, -1)
+
+    def halve(bounds, _):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        enough = 1 / (weights(jnp.exp(middle)) ** 2).sum(-1) >= effective
+        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
+
+    start = (jnp.full(log_value.shape[0], -16.0), jnp.zeros(log_value.shape[0]))
+    (low, _), _ = jax.lax.scan(halve, start, None, length=14)
+    return weights(jnp.exp(low))
+
+
+def _draw_about(contact: Contact, offset: Float[Array, "M D 3"]) -> Contact:
+    """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
+    count = offset.shape[1]
+    return Contact(
+        jnp.repeat(contact.type[:, None], count, 1),
+        jnp.repeat(contact.face[:, None], count, 1),
+        contact.x[:, None] + offset[..., 0],
+        contact.y[:, None] + offset[..., 1],
+        contact.yaw[:, None] + offset[..., 2],
+    )
+
+
+def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
+    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
+
+
+def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> Hypotheses:
+    """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
+    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods."""
+
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, None]:
+        contact, covariance = state
+        scale = jnp.linalg.cholesky(covariance)
+        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
+        offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
+        value = gains(jax.tree.map(jnp.ravel, _draw_about(contact, offset))).reshape(offset.shape[:2])
+        value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
+        weight = _temper(value, 5.0)
+        centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
+        learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
+        best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
+        floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
+        return Hypotheses(_move(contact, best), 1.2 * learned + 0.05 * covariance + floor), None
+
+    return jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))[0]
+
+
+def sharpen(
+    key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
+) -> tuple[Hypotheses, Float[Array, "M"]]:
+    """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
+    mode's covariance. Returns the modes and the best log likelihood met."""
+
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
+        contact, covariance = state
+        scale = jnp.linalg.cholesky(covariance)
+        step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
+        about = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
+        value = gains(jax.tree.map(jnp.ravel, about)).reshape(step.shape[:2])
+        value = jnp.maximum(value, -1e9)
+        best = jnp.argmax(value, 1)
+        height = value - value.max(1, keepdims=True)
+        weight = _temper(height, 0.6 * draws)
+        i, j = jnp.triu_indices(3)
+        square = step[..., i] * step[..., j] * jnp.where(i == j, 0.5, 1.0)
+        features = jnp.concatenate([jnp.ones_like(step[..., :1]), step, square], -1)
+        gram = jnp.einsum("md,mda,mdb->mab", weight, features, features) + 1e-4 * jnp.eye(10)
+        target = jnp.einsum("md,mda,md->ma", weight, features, jnp.maximum(height, -1e5))
+        fit = jnp.linalg.solve(gram, target[..., None])[..., 0]
+        slope = fit[:, 1:4]
+        upper = jnp.zeros((len(fit), 3, 3)).at[:, i, j].set(fit[:, 4:])
+        curvature = upper + upper.transpose(0, 2, 1) - upper * jnp.eye(3)
+        value_along, along = jnp.linalg.eigh(-curvature)
+        value_along = jnp.clip(value_along, 0.15, 1e4)
+        top = jnp.einsum("mab,mb,mcb,mc->ma", along, 1 / value_along, along, slope)
+        top = top / jnp.maximum(1, jnp.linalg.norm(top, axis=1, keepdims=True) / 2.5)
+        # Where the fit's top lies far from the best draw, trust the draw.
+        seen = jnp.take_along_axis(step, best[:, None, None], 1)[:, 0]
+        off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
+        top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
+        inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
+        covariance = jnp.einsum("mab,mbc,mdc->mad", scale, inverse, scale)
+        covariance += jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
+        moved = _move(contact, jnp.einsum("mab,mb->ma", scale, top))
+        return Hypotheses(moved, covariance), value.max(1)
+
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
+    return modes, values[-1]
+
+
+def adapt(
+    key: PRNGKeyArray, modes: Modes, gains: Callable, library: LibraryArrays, table: Table
+) -> Modes:
+    """Refit the mixture to weighted draws from itself until their weights are even enough. The draws are thrown away:
+    the sampler's own come after, so that nothing is chosen by its weight."""
+
+    def unfit(state: tuple) -> Array:
+        trial, ess, _, _ = state
+        return (trial < _PILOT_ROUNDS) & (ess < _PILOT_ESS)
+
+    def pilot(state: tuple) -> tuple:
+        trial, _, modes, key = state
+        key, draw_key = jax.random.split(key)
+        draws = draw_modes(draw_key, modes, _PILOT_DRAWS)
+        log_weight = gains(draws) + log_prior(draws, library, table)
+        log_weight -= jax.nn.logsumexp(log_density_modes(draws, modes), 1)
+        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
+        ess = effective_fraction(log_weight)
+        weight = _temper(log_weight[None], _PILOT_ESS * _PILOT_DRAWS)[0]
+        fitted = refit(draws, weight, modes)
+        kept = jax.tree.map(lambda new, old: jnp.where(ess < _PILOT_ESS, new, old), fitted, modes)
+        return trial + 1, ess, kept, key
+
+    return jax.lax.while_loop(unfit, pilot, (0, jnp.float32(0.0), modes, key))[2]
+
+
+def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
+    """A mixture of the modes, weighted by their log likelihoods and volumes. Flattened: the values are rough, and a
+    mode that is missed costs more than one that is tried in vain."""
+    scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
+    log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
+    log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
+    return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / len(value)))))
