@@ -47,11 +47,11 @@ def frame_from_messages(
     image: Image, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> DepthFrame:
     """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
-    intrinsics = intrinsics_from_message(info, image)
     try:
-        depth = depth_from_image(image)
+        depth = depth_from_image(image)  # first: an image of a wrong size must not be blamed on its CameraInfo
     except ValueError as error:
         raise ValueError(f"Image {error}") from None
+    intrinsics = intrinsics_from_message(info, image)
     return DepthFrame(depth, intrinsics, stamp_to_ns(image.header.stamp), image.header.frame_id, T_table_camera)
 
 

@@ -56,7 +56,7 @@ def test_stamps_survive(ns: int) -> None:
     [
         ({"encoding": "rgb8"}, "encoding"),
         ({"step": 3}, "step"),
-        ({"height": 7}, "width, height"),
+        ({"height": 7}, "data: expected 112 bytes"),
         ({"data": array.array("B", b"123")}, "data"),
     ],
 )

@@ -83,6 +83,8 @@ def test_no_camera_info_yet(bench: Bench) -> None:
         ({"encoding": "rgb8"}, "Image encoding: expected one of"),
         ({"step": 100}, "Image step: expected at least 128"),
         ({"step": 130}, "Image data: expected 6240 bytes"),
+        ({"width": 0, "height": 0}, "Image width, height: expected a positive image size"),
+        ({"width": 32, "step": 64}, "Image data: expected 3072 bytes"),
         ({"data": array.array("B", b"1234")}, "Image data: expected 6144 bytes"),
         ({"data": array.array("B", bytes(6144))}, "no pixel has a return"),
     ],
