@@ -27,7 +27,7 @@ from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pa
 
 _GLOBAL, _QUARTERS, _CANDIDATES = 64, 4, 32
 _MODES, _FINALISTS = 8, 4
-_FIT_ALL, _FIT_LAST = (20, 2), (24, 1)  # draws a mode, rounds
+_FIT = (24, 3)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _WORTH = 5.0  # nats: below, no candidate is worth a search
@@ -154,9 +154,6 @@ def find_proposal(
     def rough(contact: Contact) -> Float[Array, "N"]:
         return 4 * _gains(contact, small_depth, small, noise, window)
 
-    def exact(contact: Contact, noise: Noise = noise) -> Float[Array, "N"]:
-        return _gains(contact, scene.depth, context, noise, window)
-
     def noise_with(contact: Contact) -> Noise:
         """The noise level once the first of these objects explains what it does."""
         first = take(contact, slice(1))
@@ -166,18 +163,18 @@ def find_proposal(
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.contact), -jnp.inf), _CANDIDATES)
     found, gain = best_first(found, _distinct(found.contact, gain, (0.004, 0.05)), _MODES)
     worth = gain[0] > _WORTH
-    search_key, adapt_key = jax.random.split(key)
 
     def search() -> Modes:
-        narrow_key, first_key, last_key = jax.random.split(search_key, 3)
-        modes = narrow(narrow_key, found, rough)
-        modes, _ = best_first(modes, rough(modes.contact), _FINALISTS)
-        modes, value = sharpen(first_key, modes, exact, *_FIT_ALL)
-        # Once more, at the noise level of a scene that holds the best of them.
-        modes, value = best_first(modes, value, _FINALISTS)
-        lower = noise_with(modes.contact)
-        modes, value = sharpen(last_key, modes, lambda c: exact(c, lower), *_FIT_LAST)
-        return adapt(adapt_key, as_mixture(modes, value), lambda c: exact(c, lower), library, table)
+        narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
+        modes, value = narrow(narrow_key, found, rough)
+        modes, _ = best_first(modes, value, _FINALISTS)
+        noise = noise_with(modes.contact)
+
+        def exact(contact: Contact) -> Float[Array, "N"]:
+            return _gains(contact, scene.depth, context, noise, window)
+
+        modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
+        return adapt(adapt_key, as_mixture(modes, value), exact, library, table)
 
     def nothing() -> Modes:
         return as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))

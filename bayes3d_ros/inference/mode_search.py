@@ -68,11 +68,12 @@ def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
     return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
 
 
-def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> Hypotheses:
+def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypotheses, Float[Array, "M"]]:
     """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
-    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods."""
+    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes and
+    theirs."""
 
-    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, None]:
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         contact, covariance = state
         scale = jnp.linalg.cholesky(covariance)
         offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
@@ -84,9 +85,10 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> Hypotheses:
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
-        return Hypotheses(_move(contact, best), 1.2 * learned + 0.05 * covariance + floor), None
+        return Hypotheses(_move(contact, best), 1.2 * learned + 0.05 * covariance + floor), value.max(1)
 
-    return jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))[0]
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))
+    return modes, values[-1]
 
 
 def sharpen(

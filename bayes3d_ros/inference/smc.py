@@ -53,9 +53,8 @@ def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, wi
     table = table - table.max()
     log_likelihood = noise_model.log_marginal(table, grid)
     slots = (particles, max_objects)
-    nothing = Contact(
-        jnp.full(slots, -1), jnp.full(slots, -1), jnp.zeros(slots), jnp.zeros(slots), jnp.zeros(slots)
-    )
+    none, zero = jnp.full(slots, -1, jnp.int32), jnp.zeros(slots)
+    nothing = Contact(none, none, zero, zero, zero)
 
     def everywhere(a: Array) -> Array:
         return jnp.broadcast_to(a, (particles, *a.shape[1:]))
@@ -66,7 +65,7 @@ def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, wi
         scenes=everywhere(scene[None]),
         table=everywhere(table),
         log_likelihood=everywhere(log_likelihood),
-        log_weight=jnp.full(particles, -jnp.log(particles)),
+        log_weight=jnp.full(particles, -jnp.log(particles), jnp.float32),
         log_evidence=jnp.float32(0.0),
     )
 
