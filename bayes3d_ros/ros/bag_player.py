@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -109,22 +109,43 @@ def message_class(msgtype: str) -> Any:
         raise ImportError(f"{package}.msg has no {name}") from None
 
 
+class _Arguments(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def _arguments(argv: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="bag_player", description=__doc__)
+    parser = _Arguments(prog="bag_player", description=__doc__)
     parser.add_argument("bag", type=Path, help="rosbag2 folder with MCAP storage, or an .mcap file")
     parser.add_argument("--rate", type=_positive, default=1.0, help="times the recorded speed")
     parser.add_argument("--loop", action="store_true", help="start again at the end; stamps go backwards then")
     parser.add_argument("--clock", action="store_true", help="publish /clock, for nodes with use_sim_time")
-    parser.add_argument("--wait", type=float, default=1.0, help="seconds to wait for a subscriber on every topic")
+    parser.add_argument("--wait", type=_seconds, default=1.0, help="seconds to wait for a subscriber on every topic")
     parser.add_argument("--topics", nargs="+", default=[], help="play only these")
     return parser.parse_args(argv)
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
     return value
+
+
+def _seconds(text: str) -> float:
+    value = _number(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number of seconds >= 0, got {text}")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, got {text}") from None
 
 
 def main(args: list[str] | None = None) -> int:
