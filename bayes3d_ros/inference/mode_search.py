@@ -70,8 +70,8 @@ def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
 
 def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypotheses, Float[Array, "M"]]:
     """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
-    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes and
-    theirs."""
+    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes
+    and theirs."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         contact, covariance = state
