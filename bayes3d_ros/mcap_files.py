@@ -56,16 +56,16 @@ def raw_messages(bag: Path) -> Iterator[RawMessage]:
 def topics(bag: Path) -> dict[str, Topic]:
     """The topics of a bag that hold messages, by name; of a damaged bag, those that can be read.
 
-    Raises BagError; BagDamage where the damage leaves nothing.
+    Raises BagError, also where damage leaves nothing.
     """
     found: dict[str, Topic] = {}
     try:
         for message in raw_messages(bag):
             count = found[message.topic].count if message.topic in found else 0
             found[message.topic] = Topic(message.topic, message.msgtype, count + 1)
-    except BagDamage:
+    except BagDamage as error:
         if not found:
-            raise
+            raise BagError(str(error)) from None
     return dict(sorted(found.items()))
 
 
