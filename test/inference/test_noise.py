@@ -9,8 +9,8 @@ from scipy.special import expit, logsumexp
 from bayes3d_ros.inference.noise import log_marginal, noise_grid, peak, sample
 
 SIGMA_MAX = 0.005
-LOG_SIGMA = np.log(SIGMA_MAX) - 10 / 3 * np.log(2), np.log(SIGMA_MAX)  # the grid's ends
-LOGIT_P = np.log(1e-3 / 0.999), np.log(9.0)
+LOG_SIGMA = np.log(SIGMA_MAX / 10), np.log(SIGMA_MAX)
+LOGIT_P = np.log(2e-4), np.log(9.0)
 NOISES = [(0.0008, 0.05), (0.00112, 0.02), (0.002, 0.3), (0.0031, 0.1), (0.0025, 0.5)]
 
 marginal = jax.jit(log_marginal)
@@ -59,8 +59,10 @@ def table_of(residual, grid):
 
 
 def test_the_grid_is_a_proper_prior(grid):
-    """The prior's mass between the grid's ends: of sigma in (sigma_max / 10, sigma_max), and of p_outlier."""
-    expected = (1 - 2 ** (-10 / 3)) * (0.9 - 1e-3)
+    """The prior's mass between the grid's ends: of sigma up from sigma_max / 10, and of p_outlier up to 0.9."""
+    sigma, p = np.asarray(grid.coarse.sigma), np.asarray(grid.coarse.p_outlier)
+    assert sigma[-1] == pytest.approx(SIGMA_MAX) and sigma[0] < 0.11 * SIGMA_MAX and p[0] < 2e-3 and p[-1] >= 0.9
+    expected = (sigma[-1] - sigma[0]) / SIGMA_MAX * (p[-1] - p[0])
     np.testing.assert_allclose(np.exp(np.asarray(grid.log_mass, np.float64)).sum(), expected, rtol=1e-3)
     flat = jnp.full((1, len(grid.coarse.sigma), len(grid.coarse.p_outlier)), 7.0)
     np.testing.assert_allclose(float(marginal(flat, grid)[0]), 7 + np.log(expected), atol=1e-3)
@@ -76,7 +78,7 @@ def test_adding_a_constant_to_the_table_adds_it_to_the_marginal(grid):
 @pytest.mark.parametrize("count", [100, 1000, 5000, 20000])
 def test_log_marginal(grid, count):
     """The difference between scenes that the posterior must weigh (within 10 nats) is right to 0.05. What they share
-    may be off by more: the coarse grid's splines miss 1.5e-4 nats a pixel at worst, about p_outlier = 1/2."""
+    may be off by more: the coarse grid's splines miss 3e-4 nats a pixel at worst, about p_outlier = 1/2."""
     shared, between = [], []
     for sigma, p in NOISES:
         one = residuals(count, sigma, p)
@@ -88,7 +90,7 @@ def test_log_marginal(grid, count):
         error = np.array(ours) - exact
         shared.append(error[0])
         between += [e - error[0] for e, d in zip(error, exact, strict=True) if abs(d - exact[0]) < 10]
-    assert np.abs(shared).max() < 0.03 + 2e-4 * count
+    assert np.abs(shared).max() < 0.03 + 4e-4 * count
     assert len(between) > 2 * len(NOISES) and np.abs(between).max() < 0.05
 
 
