@@ -71,14 +71,15 @@ def _nearest(shape: tuple[int, int], width: int, height: int) -> tuple[np.ndarra
 
 
 def trustworthy(
-    depth: Float[np.ndarray, "height width"], width: int, height: int, reach: int = 2, spread: float = 0.03
+    depth: Float[np.ndarray, "height width"], width: int, height: int, spread: float = 0.03
 ) -> Bool[np.ndarray, "new_height new_width"]:
     """Which pixels of `resize_depth` stand among returns that agree with them.
 
     Depth cameras invent values along the edges of things (mixed pixels) and of holes. A pixel is kept if four fifths of
-    its neighbours within `reach` pixels of the full image returned, none of them more than `spread` (a share of the
-    depth) nearer or farther.
+    its neighbours in the full image returned, none of them more than `spread` (a share of the depth) nearer or farther.
+    Neighbours are the pixels that the new pixel stands for, at most 5 x 5: an image that is not reduced is left alone.
     """
+    reach = min(2, depth.shape[1] // width // 2)
     v, u = _nearest(depth.shape, width, height)
     here = depth[v[:, None], u]
     returns, agree = np.zeros(here.shape, int), np.ones(here.shape, bool)
