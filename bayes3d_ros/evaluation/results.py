@@ -20,7 +20,7 @@ SCENES, SAMPLES, FRAMES = "scenes.jsonl", "samples.npz", "frames"
 
 
 class ResultsError(Exception):
-    """Results that cannot be written; one line naming the file."""
+    """A folder that results cannot be written to; one line naming it."""
 
 
 def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class ResultsWriter:
         return self
 
     def write(self, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Path:
-        """Append a frame; depth is what was parsed, in metres. Returns where the frame's PNG belongs."""
+        """Append a frame; depth is what was parsed, in metres. Returns where its PNG belongs. Raises OSError."""
         try:
             path = self.folder / FRAMES / f"{self._frame_name(posterior.stamp_ns)}.npz"
             temporary = path.with_name(f".{path.name}.tmp")
@@ -101,8 +101,8 @@ class ResultsWriter:
             self._rows.write(framed.tobytes())
             self._scenes.write(json.dumps(scene_record(posterior), allow_nan=False) + "\n")
             self._scenes.flush()
-        except OSError as error:
-            raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
+        except OSError as error:  # a full disk; its error does not say where
+            raise OSError(error.errno, error.strerror, str(self.folder)) from error
         self.frames += 1
         return path.with_suffix(".png")
 

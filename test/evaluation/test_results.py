@@ -1,5 +1,6 @@
 """What the result files hold is what the posteriors say, and an interrupted run leaves whole lines."""
 
+import errno
 import json
 
 import numpy as np
@@ -121,3 +122,15 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultsError, match=r"file: cannot write results here"), ResultsWriter(tmp_path / "file", TYPES):
         pass
+
+
+def test_a_full_disk_names_the_folder(depth_frame, fake_posterior, tmp_path, monkeypatch):
+    def full(*arguments, **arrays):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    frame = depth_frame(1)
+    with ResultsWriter(tmp_path, TYPES) as results:
+        monkeypatch.setattr(np, "savez_compressed", full)
+        with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}'"):
+            results.write(frame.depth, fake_posterior(frame, TYPES))
+    assert (tmp_path / "scenes.jsonl").read_text() == ""
