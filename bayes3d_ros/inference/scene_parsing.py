@@ -53,16 +53,15 @@ class SceneParser:
         self._cast = jax.jit(renderers["march"])
 
     def warm_up(self, width: int, height: int) -> None:
-        """Compile for images of this size (values of the intrinsics do not matter) by parsing a synthetic frame."""
+        """Compile for images of this size (values of the intrinsics do not matter) by parsing a made-up frame: a table
+        seen by a camera 0.8 m above it, with something on it."""
         intrinsics = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
-        rays = intrinsics.rays()
-        tilt = np.float32(0.6)
-        depth = 0.8 / np.maximum(rays[..., 1] * np.cos(tilt) + np.sin(tilt), 0.2)
-        nothing = max(self.settings.max_objects, 0)
-        if nothing:
-            middle = slice(height // 2 - height // 16, height // 2 + height // 16)
-            depth[middle, width // 2 - width // 16 : width // 2 + width // 16] *= 0.9
-        self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up"))
+        above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
+        T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
+        depth = above / np.maximum(intrinsics.rays()[..., 1] * c + s, 0.2)
+        v, u, size = height // 2, width // 2, max(width // 16, 1)
+        depth[v - size : v + size, u - size : u + size] *= 0.9
+        self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
         """The posterior given one frame. Raises ParseError with one clear line when there is none."""

@@ -17,7 +17,9 @@ from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.model.rendering import reference
 
 CAMERA = Intrinsics(90.0, 90.0, 47.5, 35.5, 96, 72)
-SETTINGS = ParserSettings(score_width=96, particles=48, max_objects=3, sigma_max=0.006, table_width=0.6, table_depth=0.6)
+SETTINGS = ParserSettings(
+    score_width=96, particles=48, max_objects=3, sigma_max=0.006, table_width=0.6, table_depth=0.6
+)
 SIGMA = 0.002
 
 
@@ -112,6 +114,15 @@ def test_nothing_is_compiled_again(parser, library):
     swapped = Library(tuple(replace(m, name=f"other_{m.name}") for m in library.models[::-1]))
     SceneParser(swapped, SETTINGS).parse(frame(library, [(0, 0.0, 0.0, 0.4)])[0])
     assert (smc.step._cache_size(), smc.init._cache_size()) == traces
+
+
+@pytest.mark.parametrize("table", ["auto", "pose", "depth"])
+def test_warm_up_compiles_all_that_a_frame_needs(library, table):
+    parser = SceneParser(library, replace(SETTINGS, table=table))
+    parser.warm_up(CAMERA.width, CAMERA.height)
+    traces = smc.step._cache_size()
+    parser.parse(frame(library, [(0, 0.0, 0.0, 0.4)])[0])
+    assert smc.step._cache_size() == traces
 
 
 def test_fixed_number_of_objects(library):
