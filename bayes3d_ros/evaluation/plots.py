@@ -205,7 +205,7 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
     lines = (
         f"p(number of objects)   {counts}",
         f"depth noise σ {1e3 * posterior.sigma:.2f} mm    outliers {100 * posterior.p_outlier:.1f} %",
-        f"log evidence over the empty table {posterior.log_evidence:.5g}    {posterior.seconds:.2f} s",
+        f"log evidence over the empty table {posterior.log_evidence:.1f}    {posterior.seconds:.2f} s",
         *(_shorten(note, 74) for note in posterior.notes[:2]),
     )
     axis.text(0.0, y - step - 0.02, "\n".join(lines), fontsize=9, color="#444444", va="top", linespacing=1.6)
