@@ -68,9 +68,10 @@ def enumerate_evidence(context, grid, empty):
     x = (np.arange(14) - 6.5) * width[0]
     cells = np.stack(np.meshgrid(np.arange(6), x, x, np.arange(12) * width[2], indexing="ij"), -1).reshape(-1, 4)
     third = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3) / 3
+    cells = cells[(np.abs(cells[:, 1:3]) < 0.19).all(-1)]  # no face is narrower: beyond, there is no prior
     value, rest, totals = evaluate(cells), -np.inf, []
     # Nats of the best, and most cells: the smaller the cells, the better their middles stand for them.
-    for within, most in ((1500, 120), (800, 120), (300, 120), (100, 120), (16, 1500)):
+    for within, most in ((1500, 40), (800, 40), (300, 50), (100, 60), (16, 1500)):
         keep = value > max(value.max() - within, np.sort(value)[-min(most, len(value))])
         rest = np.logaddexp(rest, logsumexp(value[~keep]) + np.log(width.prod()))
         cells = np.repeat(cells[keep], 27, 0)
