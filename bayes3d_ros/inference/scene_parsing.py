@@ -1,5 +1,6 @@
 """Parse one depth frame into a posterior over scenes."""
 
+import contextlib
 import time
 from typing import NamedTuple
 
@@ -61,7 +62,10 @@ class SceneParser:
         depth = above / np.maximum(intrinsics.rays()[..., 1] * c + s, 0.2)
         v, u, size = height // 2, width // 2, max(width // 16, 1)
         depth[v - size : v + size, u - size : u + size] *= 0.9
-        self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera))
+        with contextlib.suppress(ParseError):  # unusual settings may leave nothing of the frame
+            self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera))
+        rays = jnp.zeros((height, width))
+        self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
         """The posterior given one frame. Raises ParseError with one clear line when there is none."""
@@ -233,7 +237,8 @@ class SceneParser:
             T = np.eye(4, dtype=np.float32)
             T[:3, :3] = Rotation.from_quat(samples.orientation[summary.reference, slot]).as_matrix()
             T[:3, 3] = samples.position[summary.reference, slot]
-            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T), (rays[..., 0], rays[..., 1])))
+            pair = (jnp.asarray(rays[..., 0]), jnp.asarray(rays[..., 1]))
+            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T), pair))
             nearer = drawn < depth
             depth, labels = np.where(nearer, drawn, depth), np.where(nearer, np.uint16(label), labels)
         return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels

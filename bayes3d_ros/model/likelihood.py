@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 NO_RETURN, IN_WORKSPACE, BEYOND = 0, 1, 2  # kinds of pixels
 _FAR_AWAY = 1e6  # stands for an infinite squared distance
+_SCALE = 1e4
 
 
 class Noise(NamedTuple):
@@ -102,14 +103,16 @@ def log_likelihood(
 def _sum_log(
     outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"]
 ) -> Float[Array, "S P T"]:
-    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels: each lies in 1e-8 .. 1e5."""
+    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels. Scaled, so that products stay
+    in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre."""
+    outlier, inlier = _SCALE * outlier, _SCALE * inlier
     p = p[None, :, None]
 
     def four(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
         product: Array | float = 1.0
         for m in range(4):
             product *= p * outlier[4 * k + m] + (1 - p) * inlier[:, None, 4 * k + m]
-        return total + jnp.log(product)
+        return total + (jnp.log(product) - 4 * jnp.log(_SCALE))
 
     start = jnp.zeros((inlier.shape[0], p.shape[1], outlier.shape[1]))
     return jax.lax.fori_loop(0, outlier.shape[0] // 4, four, start)
