@@ -103,8 +103,8 @@ def log_likelihood(
 def _sum_log(
     outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"]
 ) -> Float[Array, "S P T"]:
-    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels. Scaled, so that products stay
-    in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre."""
+    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels. Scaled, so that products
+    stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre."""
     outlier, inlier = _SCALE * outlier, _SCALE * inlier
     p = p[None, :, None]
 
