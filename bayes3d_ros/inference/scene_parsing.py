@@ -26,7 +26,7 @@ from bayes3d_ros.model.scene_graph import Contact, Table
 from bayes3d_ros.model.scene_score import Image
 from bayes3d_ros.model.summaries import summarise
 
-_NEGLIGIBLE = np.log(0.1)  # a number of objects this much less likely than the best ends the search for more
+_NEGLIGIBLE = np.log(0.15)  # a number of objects this much less likely than the best ends the search for more
 
 
 class _Stage(NamedTuple):
