@@ -27,7 +27,7 @@ from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pa
 
 _GLOBAL, _QUARTERS, _CANDIDATES = 64, 4, 32
 _MODES, _FINALISTS = 8, 4
-_FIT = (20, 2)  # draws a mode, rounds
+_FIT = (24, 3)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _WORTH = 5.0  # nats: below, no candidate is worth a search

@@ -13,8 +13,8 @@ from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
 
 Tree = TypeVar("Tree")
-_DRAWS, _ROUNDS = 16, 4  # of `narrow`: draws a mode, rounds
-_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 4, 64, 0.2
+_DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
+_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 5, 96, 0.25
 _INFLATION, _FLATTEN = 1.5, 4.0
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
 

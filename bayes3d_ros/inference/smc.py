@@ -106,8 +106,11 @@ def step(
     log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
 
     log_weight = log_weight + log_ratio
-    total = jax.nn.logsumexp(log_weight)
-    normalised = jnp.where(jnp.isfinite(total), log_weight - total, -jnp.log(particles))
+    best = jnp.max(log_weight)
+    log_weight = log_weight - jnp.where(jnp.isfinite(best), best, 0.0)  # thousands of nats cost float32 four digits
+    mean = jax.nn.logsumexp(log_weight)
+    normalised = jnp.where(jnp.isfinite(mean), log_weight - mean, -jnp.log(particles))
+    total = best + mean
     next_state = State(
         objects, covered, scenes, table, log_likelihood, normalised, state.log_evidence + total
     )
