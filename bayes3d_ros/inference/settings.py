@@ -53,7 +53,7 @@ class ParserSettings:
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
     )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
-    particles: int = setting(128, "scenes carried by the sampler", low=1, high=100000)
+    particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)
     seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
 
