@@ -115,11 +115,6 @@ def candidates(
     return best_first(found, _distinct(found.contact, score, (0.008, 0.1)), _CANDIDATES)
 
 
-def _sorted_with(contact: Contact, score: Float[Array, "N"], count: int) -> tuple[Contact, tuple[Array, Array]]:
-    best, index = jax.lax.top_k(score, count)
-    return take(contact, index), (best, index)
-
-
 def _gains(
     contact: Contact, depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int
 ) -> Float[Array, "N"]:
