@@ -15,6 +15,7 @@ it, it is an outlier, p_out a(z); elsewhere it has the scene-independent density
 Arrays are [rows, columns, tiles]: tiles come last, so that every operation runs along them.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -82,6 +83,7 @@ def outlier_density(pixels: Pixels) -> Float[Array, "h w T"]:
     return pixels.outlier_scale * pixels.depth**2
 
 
+@partial(jax.jit, static_argnames="window")
 def log_likelihood(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
 ) -> Float[Array, "S P T"]:
