@@ -19,6 +19,11 @@ class SensorNoise:
     range_correlation: how far the range noise of neighbouring pixels hangs together, pixels (matching windows overlap).
     bias: standard deviation of a smooth error of depth, metres, the same in every frame of a recording.
     bias_length: the distance over which that error changes, metres.
+    image_bias: largest error that varies slowly over the image (less than a wave across it), metres; see
+        correlated_errors.py for this and the next three.
+    object_bias: largest error of an object as a whole, metres; every object has its own, uniform within this.
+    waviness: standard deviation of waves in every surface, fixed in the world, metres of depth.
+    waviness_length: how far apart two points are whose waves have a correlation of exp(-1/2), metres.
     disparity_step: disparities are multiples of this, pixels.
     depth_step: depths are multiples of this, metres.
     baseline: distance to the second imager (to the camera's right), metres; what that one cannot see does not return.
@@ -35,6 +40,10 @@ class SensorNoise:
     range_correlation: float = 1.0
     bias: float = 0.0008
     bias_length: float = 0.05
+    image_bias: float = 0.0
+    object_bias: float = 0.0
+    waviness: float = 0.0
+    waviness_length: float = 0.05
     disparity_step: float = 1 / 32
     depth_step: float = 0.001
     baseline: float = 0.05
@@ -58,7 +67,11 @@ class SensorNoise:
 
 
 NO_NOISE = SensorNoise(
-    **{f.name: 0.0 for f in fields(SensorNoise) if f.name not in ("bias_length", "max_range", "edge_jump")}
+    **{
+        f.name: 0.0
+        for f in fields(SensorNoise)
+        if f.name not in ("bias_length", "waviness_length", "max_range", "edge_jump")
+    }
 )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayes3d_ros.bags import BagWriter
+from bayes3d_ros.evaluation.correlated_errors import draw_correlated_errors
 from bayes3d_ros.evaluation.ray_casting import Box, RayCaster, Rendering
 from bayes3d_ros.evaluation.scene_file import Scene, load_scene
 from bayes3d_ros.evaluation.sensor_noise import add_sensor_noise, draw_bias_field
@@ -49,15 +50,17 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
     """
     scene = load_scene(scene_yaml)
     caster = scene_caster(scene)
-    camera_seed, *frame_seeds = np.random.SeedSequence(scene.seed).spawn(1 + len(scene.cameras))
+    camera_seed, *frame_seeds, surface_seed = np.random.SeedSequence(scene.seed).spawn(2 + len(scene.cameras))
     bias = draw_bias_field(scene.noise, np.random.default_rng(camera_seed))
+    errors = draw_correlated_errors(scene.noise, len(scene.objects), np.random.default_rng(surface_seed))
     truth = []
     with BagWriter(out) as bag:
         for index, T_table_camera in enumerate(scene.cameras):
             stamp = scene.start_ns + round(index * 1e9 / scene.rate)
             clean = caster.render(T_table_camera, scene.intrinsics)
             rng = np.random.default_rng(frame_seeds[index])
-            depth = add_sensor_noise(clean.depth, clean.cosine, scene.intrinsics, scene.noise, bias, rng)
+            depth = clean.depth + errors.at(clean, T_table_camera, scene.intrinsics)
+            depth = add_sensor_noise(depth, clean.cosine, scene.intrinsics, scene.noise, bias, rng)
             bag.write(DepthFrame(depth, scene.intrinsics, stamp, FRAME_ID, T_table_camera))
             truth.append(_truth(scene, stamp, T_table_camera, visible_fractions(scene, index, clean)))
             if progress is not None:
