@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import bayes3d_ros
+from bayes3d_ros.evaluation.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.bags import FrameReader
@@ -256,6 +257,57 @@ def demo(out: Path) -> None:
         run_demo(out, click.echo)
     except DemoError as error:
         raise click.ClickException(str(error)) from error
+
+
+@main.command()
+@click.argument("experiment", type=click.Choice(list(EXPERIMENTS)))
+@click.option("--quick", is_flag=True, help="A minute or so: every kind of measurement once.")
+@click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its plots.")
+@_device_option
+def evaluate(experiment: str, quick: bool, out: Path) -> None:
+    """Measure how right the results are: rows as JSON, a summary and plots."""
+    from bayes3d_ros.evaluation import benchmark, experiments
+    from bayes3d_ros.inference.compilation import enable_cache
+
+    enable_cache()
+    module = experiments.load(experiment)
+    notes = module.notes(quick)
+    report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": notes, "summary": None}
+    report |= {"machine": benchmark.machine(), "versions": benchmark.versions(), "rows": []}
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / f"{experiment}.json"
+    _write_json(file, report)  # now, so that a folder that cannot be written to is known before minutes of measuring
+    for note in notes:
+        click.echo(note, err=True)
+    click.echo(module.HEADER)
+    for rows in _progress(module.steps(quick), module.count(quick), "step"):
+        report["rows"] += rows
+        for row in rows:
+            _say(module.line(row))
+        _write_json(file, report)  # after every step: an interrupted run leaves what it measured
+    report["summary"] = module.summary(report["rows"])
+    _write_json(file, report)
+    click.echo("")
+    for name, value in report["summary"].items():
+        click.echo(f"{name:<20} {_words(value)}")
+    for path in (file, *module.plot(report["rows"], out)):
+        click.echo(f"{path}")
+
+
+def _words(value: Any) -> str:
+    """A value of a summary in one line."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(part)}" for name, part in value.items())
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else f"{value}"
+
+
+def _write_json(file: Path, content: Any) -> None:
+    """Whole or not at all, so that who reads it meanwhile, or after a kill, finds valid JSON."""
+    import json
+
+    temporary = file.with_name(f".{file.name}.tmp")
+    temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    os.replace(temporary, file)
 
 
 @main.command()
