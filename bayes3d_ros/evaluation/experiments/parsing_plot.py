@@ -40,7 +40,7 @@ def _accuracy(axis: Axes, objects: list[Row], types: list[str]) -> None:
     found = [row for row in told if row["add_s"] is not None]
     missed = [row for row in told if not row["found"]]
     top = max([1.15 * LIMIT_MM, *(1.15e3 * row["add_s"] for row in found)])
-    axis.axhspan(LIMIT_MM, top * 1.1, 0.5, 1, color=FAILED, alpha=0.07, linewidth=0)
+    axis.axhspan(LIMIT_MM, top * 1.1, 0.5 / 1.05, 1, color=FAILED, alpha=0.07, linewidth=0)
     axis.axhline(LIMIT_MM, color=FAILED, linewidth=1)
     axis.text(0.02, LIMIT_MM, "1 cm", color=FAILED, fontsize=9, va="bottom")
     for k, name in enumerate(types):
