@@ -19,7 +19,7 @@ class SensorNoise:
     range_correlation: how far the range noise of neighbouring pixels hangs together, pixels (matching windows overlap).
     bias: standard deviation of a smooth error of depth, metres, the same in every frame of a recording.
     bias_length: the distance over which that error changes, metres.
-    image_bias: largest error that varies slowly over the image (less than a wave across it), metres; see
+    image_bias: largest error that varies slowly over the image (at most a wave across it), metres; see
         correlated_errors.py for this and the next three.
     object_bias: largest error of an object as a whole, metres; every object has its own, uniform within this.
     waviness: standard deviation of waves in every surface, fixed in the world, metres of depth.
