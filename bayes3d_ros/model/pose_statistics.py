@@ -1,25 +1,27 @@
-"""Mean and spread of weighted poses, where the poses may have several modes."""
+"""Means and spreads of weighted poses that may have several modes."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-MODE_ANGLE = np.radians(20.0)  # poses farther from a mode's centre than this, in rotation ...
-MODE_DISTANCE = 0.05  # ... or than this in metres, belong to another mode
-CANDIDATES = 64  # poses tried as the centre of the heaviest mode
+from bayes3d_ros.model.pose_modes import middle, mode_labels, nodes
+from bayes3d_ros.model.posterior import PoseMode
+
+LOCAL_ANGLE = np.radians(20.0)  # a mode's pose is a mean over its poses within this ...
+LOCAL_DISTANCE = 0.05  # ... and this, in metres, of its middle
 
 
 class PoseStatistics(NamedTuple):
     """position [3] and orientation [4] (quaternion x y z w, w >= 0) of the heaviest mode; covariance [6, 6]: the
     second moment of all poses about that one (x y z, then delta in R = Exp(delta) R_mean, on the axes of the frame the
-    poses are given in; metres and radians); members [N]: the poses of the mode."""
+    poses are given in; metres and radians); modes: heaviest first, weights sum to one."""
 
     position: Float[np.ndarray, "3"]
     orientation: Float[np.ndarray, "4"]
     covariance: Float[np.ndarray, "6 6"]
-    members: Bool[np.ndarray, "N"]
+    modes: tuple[PoseMode, ...]
 
 
 def rotation_vectors(quaternion: Float[np.ndarray, "N 4"], origin: Float[np.ndarray, "4"]) -> Float[np.ndarray, "N 3"]:
@@ -43,42 +45,78 @@ def rotation_mean(quaternion: Float[np.ndarray, "N 4"], weights: Float[np.ndarra
     return mean
 
 
-def heaviest_mode(
-    position: Float[np.ndarray, "N 3"], quaternion: Float[np.ndarray, "N 4"], weights: Float[np.ndarray, "N"]
-) -> Bool[np.ndarray, "N"]:
-    """Which poses lie around the one with the most weight near it. A can seen from the side has no single yaw: a mean
-    over all of them would be far from every one; the mean over one mode is not."""
-    order = np.lexsort(np.concatenate([quaternion, position], 1).T)  # the answer must not hang on the samples' order
-    cumulative = np.cumsum(weights[order])
-    strata = (np.arange(CANDIDATES) + 0.5) / CANDIDATES * cumulative[-1]
-    candidates = np.unique(order[np.searchsorted(cumulative, strata).clip(max=len(order) - 1)])
-    cosine = np.abs(quaternion[candidates] @ quaternion.T)
-    offset = position - position[0]
-    squares = np.square(offset).sum(1)
-    distance2 = squares[candidates, None] + squares - 2 * offset[candidates] @ offset.T
-    near = (cosine > np.cos(MODE_ANGLE / 4)) & (distance2 < np.square(MODE_DISTANCE / 2))
-    centre = int(np.argmax(near @ weights))
-    return (cosine[centre] > np.cos(MODE_ANGLE / 2)) & (distance2[centre] < np.square(MODE_DISTANCE))
+def second_moment(
+    position: Float[np.ndarray, "N 3"],
+    quaternion: Float[np.ndarray, "N 4"],
+    weights: Float[np.ndarray, "N"],
+    origin_position: Float[np.ndarray, "3"],
+    origin_quaternion: Float[np.ndarray, "4"],
+) -> Float[np.ndarray, "6 6"]:
+    """Of the poses about the origin: x y z, then rotation_vectors."""
+    delta = np.concatenate([position - origin_position, rotation_vectors(quaternion, origin_quaternion)], 1)
+    return (delta * weights[:, None]).T @ delta / weights.sum()
+
+
+def pose_mode(
+    position: Float[np.ndarray, "N 3"],
+    quaternion: Float[np.ndarray, "N 4"],
+    weights: Float[np.ndarray, "N"],
+    face: Int[np.ndarray, "N"],
+) -> PoseMode:
+    """One mode of these poses, of weight sum(weights).
+
+    Its pose is their mean (on SO(3) for the rotation) where all are close together. Along an arc or a ring the mean of
+    all may be far from every one: there it is the mean of those near the middle. The covariance is the second moment of
+    all about that pose.
+    """
+    local = _near(position, quaternion, int(np.argmax(weights)))
+    if not local.all():
+        local = _near(position, quaternion, middle(nodes(position, quaternion, weights)))
+    inside = weights[local] / weights[local].sum()
+    mean_position, mean_rotation = inside @ position[local], rotation_mean(quaternion[local], inside)
+    return PoseMode(
+        weight=float(weights.sum()),
+        position=mean_position,
+        orientation=mean_rotation,
+        covariance=second_moment(position, quaternion, weights, mean_position, mean_rotation),
+        contact_face=int(np.bincount(face[local].clip(0), inside).argmax()),
+    )
 
 
 def pose_statistics(
-    position: Float[np.ndarray, "N 3"], quaternion: Float[np.ndarray, "N 4"], weights: Float[np.ndarray, "N"]
+    position: Float[np.ndarray, "N 3"],
+    quaternion: Float[np.ndarray, "N 4"],
+    weights: Float[np.ndarray, "N"],
+    face: Int[np.ndarray, "N"],
 ) -> PoseStatistics:
-    """Where the poses have one mode: their mean and covariance. Else the mean of the heaviest mode, and the spread of
-    all poses about it: what is not known stays wide. Quaternions are x y z w; weights need not sum to one."""
+    """Modes of the poses (pose_modes.py says what a mode is). The pose of the whole is the heaviest mode's, since a
+    mean over several would be no pose of the object; its covariance is the spread of all poses about it, so that
+    whoever reads only these is told of the other modes. Quaternions are x y z w; weights need not sum to one. The order
+    of the poses does not matter."""
+    order = np.lexsort([weights, *quaternion.T, *position.T])
+    position, quaternion, weights, face = position[order], quaternion[order], weights[order], face[order]
     position, weights = position.astype(float), weights.astype(float) / weights.sum()
     quaternion = quaternion.astype(float) / np.sqrt(np.square(quaternion).sum(1))[:, None]
-    # A quaternion and its negative are one rotation: give both the same sign before they are compared.
-    leading = np.take_along_axis(quaternion, np.abs(quaternion).argmax(1)[:, None], 1)
-    quaternion = quaternion * np.sign(leading)
+    # A quaternion and its negative are one rotation: give both the same sign, so that equal poses are found equal.
+    quaternion = quaternion * np.sign(np.take_along_axis(quaternion, np.abs(quaternion).argmax(1)[:, None], 1))
 
-    heaviest = int(np.argmax(weights))
-    members = (np.abs(quaternion @ quaternion[heaviest]) > np.cos(MODE_ANGLE / 2)) & (
-        np.square(position - position[heaviest]).sum(1) < np.square(MODE_DISTANCE)
+    label = mode_labels(position, quaternion, weights, face)
+    found = []
+    for k in range(label.max() + 1):
+        own = label == k
+        found.append(pose_mode(position[own], quaternion[own], weights[own], face[own]))
+    total = sum(mode.weight for mode in found)
+    modes = tuple(mode._replace(weight=mode.weight / total) for mode in found)
+    heaviest = modes[0]
+    covariance = heaviest.covariance
+    if len(modes) > 1 or total < 1:
+        covariance = second_moment(position, quaternion, weights, heaviest.position, heaviest.orientation)
+    return PoseStatistics(heaviest.position, heaviest.orientation, covariance, modes)
+
+
+def _near(
+    position: Float[np.ndarray, "N 3"], quaternion: Float[np.ndarray, "N 4"], centre: int
+) -> Bool[np.ndarray, "N"]:
+    return (np.abs(quaternion @ quaternion[centre]) > np.cos(LOCAL_ANGLE / 2)) & (
+        np.square(position - position[centre]).sum(1) < np.square(LOCAL_DISTANCE)
     )
-    if not members.all():
-        members = heaviest_mode(position, quaternion, weights)
-    inside = weights[members] / weights[members].sum()
-    mean_position, mean_rotation = inside @ position[members], rotation_mean(quaternion[members], inside)
-    delta = np.concatenate([position - mean_position, rotation_vectors(quaternion, mean_rotation)], 1)
-    return PoseStatistics(mean_position, mean_rotation, (delta * weights[:, None]).T @ delta, members)

@@ -20,9 +20,24 @@ class SceneSamples(NamedTuple):
     sigma: Float[np.ndarray, "S"]  # metres, a standard deviation
 
 
+class PoseMode(NamedTuple):
+    """One of the places where an object may be: a peak of its pose's density with all that flows up to it."""
+
+    weight: float  # given the object's type; those of all modes sum to one
+    position: Float[np.ndarray, "3"]  # T_camera_object
+    orientation: Float[np.ndarray, "4"]  # quaternion x y z w
+    covariance: Float[np.ndarray, "6 6"]  # of this mode alone; as ObjectEstimate.covariance
+    contact_face: int
+
+
 @dataclass(frozen=True)
 class ObjectEstimate:
-    """One object of the best scene, with what the other samples say of it."""
+    """One object of the best scene, with what the other samples say of it.
+
+    All but the first three fields is given the most probable type. The pose is that of the heaviest mode: it is a
+    pose of the object, as a mean over several modes would not be. The covariance is the second moment of *all* poses
+    about it, so it is wide where there are other modes.
+    """
 
     type: str
     type_probabilities: dict[str, float]
@@ -30,7 +45,9 @@ class ObjectEstimate:
     position: Float[np.ndarray, "3"]  # T_camera_object
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
     covariance: Float[np.ndarray, "6 6"]  # x y z, then delta in R = Exp(delta) R_mean, on the camera's axes
-    contact_face: int
+    contact_face: int  # of the heaviest mode
+    modes: tuple[PoseMode, ...] = ()  # heaviest first; empty where they were not worked out
+    face_probabilities: tuple[float, ...] = ()  # p(face 0) .. p(face 5); empty likewise
 
 
 @dataclass(frozen=True)

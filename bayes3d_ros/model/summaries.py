@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.model.matching import same_objects
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.pose_statistics import PoseStatistics, pose_statistics
-from bayes3d_ros.model.posterior import ObjectEstimate, SceneSamples
+from bayes3d_ros.model.posterior import ObjectEstimate, PoseMode, SceneSamples
 
 ANGLE_LENGTH = 0.05  # metres a radian counts for when poses are compared
 
@@ -93,6 +93,15 @@ def object_estimates(
     weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
     weights /= weights.sum()
     return tuple(_estimate(samples, weights, object_index == k, types) for k in range(count))
+
+
+def modes_by_type(
+    samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], k: int
+) -> dict[str, tuple[PoseMode, ...]]:
+    """Modes of object k's pose given each type that any sample gives it; poses are of that type's own frame."""
+    weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
+    held = np.where(object_index == k, samples.type, -1)
+    return {types[t]: _pose(samples, weights, held == t).modes for t in np.unique(held[held >= 0]).tolist()}
 
 
 def posterior_rows(samples: SceneSamples, object_index: Int[np.ndarray, "S M"]) -> np.ndarray:
@@ -205,12 +214,10 @@ def _estimate(
     sample, slot = np.nonzero(member)
     kind = samples.type[sample, slot]
     by_type = np.bincount(kind, weights[sample], minlength=len(types))
-    of_type = (kind == by_type.argmax()) & (weights[sample] > 1e-12 * weights[sample].max())
-    sample, slot = sample[of_type], slot[of_type]
-    pose: PoseStatistics = pose_statistics(
-        samples.position[sample, slot], samples.orientation[sample, slot], weights[sample]
-    )
-    faces = np.bincount(samples.face[sample, slot][pose.members].clip(min=0), weights[sample][pose.members])
+    of_type = member & (samples.type == by_type.argmax())
+    pose = _pose(samples, weights, of_type)
+    sample, slot = np.nonzero(of_type)
+    by_face = np.bincount(samples.face[sample, slot].clip(0), weights[sample], minlength=6)
     ranked = sorted(np.flatnonzero(by_type).tolist(), key=lambda t: (-by_type[t], t))
     return ObjectEstimate(
         type=types[ranked[0]],
@@ -219,5 +226,17 @@ def _estimate(
         position=pose.position,
         orientation=pose.orientation,
         covariance=pose.covariance,
-        contact_face=int(faces.argmax()),
+        contact_face=pose.modes[0].contact_face,
+        modes=pose.modes,
+        face_probabilities=tuple(float(p) for p in by_face / by_face.sum()),
+    )
+
+
+def _pose(samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[np.ndarray, "S M"]) -> PoseStatistics:
+    """Statistics of the poses of these objects, all of one type."""
+    sample, slot = np.nonzero(member)
+    heavy = weights[sample] > 1e-12 * weights[sample].max()
+    place = sample[heavy], slot[heavy]
+    return pose_statistics(
+        samples.position[place], samples.orientation[place], weights[place[0]], samples.face[place].clip(0)
     )

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.model.matching import match, same_objects
 from bayes3d_ros.model.pose_statistics import pose_statistics, rotation_mean, rotation_vectors
 from bayes3d_ros.model.posterior import SceneSamples
-from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, posterior_rows, summarise
+from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, modes_by_type, posterior_rows, summarise
 
 TYPES = ("bowl", "can", "mug")
 
@@ -64,6 +64,10 @@ def test_one_sample_gives_its_pose_and_no_spread():
     np.testing.assert_allclose(found.position, [0.1, -0.2, 0.9], atol=1e-12)
     np.testing.assert_allclose(found.orientation, turn, atol=1e-12)
     np.testing.assert_allclose(found.covariance, 0, atol=1e-20)
+    (mode,) = found.modes
+    assert (mode.weight, mode.contact_face) == (pytest.approx(1.0), 4)
+    np.testing.assert_array_equal(mode.position, found.position)
+    assert found.face_probabilities == (0, 0, 0, 0, 1, 0)
     assert summary.slots == (0,) and summary.num_objects == {0: 0.0, 1: pytest.approx(1.0)}
 
 
@@ -110,10 +114,27 @@ def test_a_can_without_a_yaw_reports_a_pose_that_is_a_pose_of_it():
 def test_two_modes_report_the_heavier_one_and_the_whole_spread():
     flip = Rotation.from_rotvec([0, 0, np.pi])
     position, quaternion = np.zeros((10, 3)), np.array([[0.0, 0, 0, 1]] * 6 + [flip.as_quat()] * 4)
-    found = pose_statistics(position, quaternion, np.full(10, 0.1))
+    found = pose_statistics(position, quaternion, np.full(10, 0.1), np.full(10, 4))
     np.testing.assert_allclose(found.orientation, [0, 0, 0, 1], atol=1e-12)
     assert found.covariance[5, 5] == pytest.approx(0.4 * np.pi**2)
-    assert found.members.tolist() == [True] * 6 + [False] * 4
+    assert [mode.weight for mode in found.modes] == pytest.approx([0.6, 0.4])
+
+
+def test_modes_and_faces_are_of_each_type_by_itself():
+    """A mug on one face in two places, or on another; and a few cans, which must not touch what is said of the mug."""
+    weights = [0.4, 0.2, 0.3, 0.1]
+    scenes = [[(2, [0, 0, 0.8])], [(2, [0.08, 0, 0.8])], [(2, [0, 0, 0.8])], [(1, [0.01, 0, 0.8])]]
+    samples = samples_of(scenes, weights)
+    samples.face[:, 0] = [4, 4, 0, 2]
+    summary = summarise(samples, TYPES, 0.5)
+    (found,) = summary.objects
+    assert found.face_probabilities == pytest.approx((1 / 3, 0, 0, 0, 2 / 3, 0))
+    assert [(m.contact_face, round(m.weight, 6)) for m in found.modes] == [(4, 0.444444), (0, 0.333333), (4, 0.222222)]
+    assert found.contact_face == 4
+    by_type = modes_by_type(samples, summary.object_index, TYPES, 0)
+    assert set(by_type) == {"can", "mug"}
+    assert [m.weight for m in by_type["mug"]] == pytest.approx([m.weight for m in found.modes])
+    np.testing.assert_allclose(by_type["can"][0].position, [0.01, 0, 0.8], atol=1e-12)
 
 
 def random_scenes(seed: int, count=60) -> SceneSamples:
@@ -149,6 +170,8 @@ def test_the_order_of_samples_and_slots_means_nothing(seed):
         np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-12)
         assert a.probability == pytest.approx(b.probability)
         assert a.type_probabilities == pytest.approx(b.type_probabilities)
+        assert a.face_probabilities == pytest.approx(b.face_probabilities)
+        assert [m.weight for m in a.modes] == pytest.approx([m.weight for m in b.modes])
     np.testing.assert_array_equal(np.take_along_axis(one.object_index[order], slots, 1), two.object_index)
     assert one.num_objects == pytest.approx(two.num_objects)
 
@@ -166,6 +189,8 @@ def test_probabilities_are_weights_of_samples(seed):
     for k, found in enumerate(summary.objects):
         assert found.probability == pytest.approx(weights[(summary.object_index == k).any(1)].sum())
         assert sum(found.type_probabilities.values()) == pytest.approx(1.0)
+        assert len(found.face_probabilities) == 6 and sum(found.face_probabilities) == pytest.approx(1.0)
+        assert sum(mode.weight for mode in found.modes) == pytest.approx(1.0)
         assert next(iter(found.type_probabilities)) == found.type
         assert summary.object_index[summary.reference, summary.slots[k]] == k
 
