@@ -27,7 +27,9 @@ SCENE_KEYS = {
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
+    *("face_probabilities", "modes"),
 }
+MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
 FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma")
 WHOLE = ("sample", "n", "object", "type", "face", "frame")
 BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "seconds"}
@@ -78,6 +80,11 @@ def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
         assert sum(found["type_probabilities"].values()) == pytest.approx(1)
         assert 0.9 < found["probability"] <= 1
         assert found["contact_face"] in range(6)
+        assert len(found["face_probabilities"]) == 6 and sum(found["face_probabilities"]) == pytest.approx(1)
+        assert all(set(mode) == MODE_KEYS and mode["contact_face"] in range(6) for mode in found["modes"])
+        weights = [mode["weight"] for mode in found["modes"]]
+        assert sum(weights) == pytest.approx(1) and weights == sorted(weights, reverse=True)
+        assert found["position"] == found["modes"][0]["position"]
         (thing,) = frame["objects"]
         np.testing.assert_allclose(found["position"], np.array(thing["T_camera_object"])[:3, 3], atol=0.01)
         assert np.linalg.norm(found["orientation"]) == pytest.approx(1)

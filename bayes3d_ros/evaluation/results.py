@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.lib import format as npy
 
-from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
+from bayes3d_ros.model.posterior import ObjectEstimate, PoseMode, ScenePosterior
 from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, posterior_rows
 
 SCENES, SAMPLES, FRAMES = "scenes.jsonl", "samples.npz", "frames"
@@ -50,6 +50,18 @@ def _object_record(found: ObjectEstimate) -> dict[str, Any]:
         "orientation": _numbers(found.orientation),
         "covariance": _numbers(found.covariance),
         "contact_face": int(found.contact_face),
+        "face_probabilities": _numbers(found.face_probabilities),
+        "modes": [_mode_record(mode) for mode in found.modes],
+    }
+
+
+def _mode_record(mode: PoseMode) -> dict[str, Any]:
+    return {
+        "weight": _number(mode.weight),
+        "position": _numbers(mode.position),
+        "orientation": _numbers(mode.orientation),
+        "covariance": _numbers(mode.covariance),
+        "contact_face": int(mode.contact_face),
     }
 
 

@@ -186,9 +186,9 @@ def errors(posterior: ScenePosterior, library: Library, true_poses: dict[str, np
 
 
 def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> list[str]:
-    """A line per object: type, probabilities, pose, standard deviations, distance from the truth."""
+    """A line per object: type, probabilities, pose, standard deviations, distance from the truth, modes of the pose."""
     head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'position, m':<23}{'orientation xyzw':<28}"
-    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'ADD-S, mm':>10}"]
+    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'ADD-S, mm':>10}  p(mode)"]
     for estimate in posterior.objects:
         sigma = np.sqrt(np.diag(estimate.covariance))
         probability = estimate.type_probabilities[estimate.type]
@@ -196,7 +196,8 @@ def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> l
         lines.append(
             f"{estimate.type:<22}{probability:>8.3f}{estimate.probability:>10.3f}  "
             f"{_row(estimate.position, 3, 23)}{_row(estimate.orientation, 3, 28)}"
-            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>10}"
+            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>10}  "
+            + " ".join(f"{mode.weight:.2f}" for mode in estimate.modes[:4])
         )
     counts = ", ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items() if p > 5e-4)
     lines.append(f"p(number of objects) {counts}; parsed in {posterior.seconds * 1e3:.0f} ms")

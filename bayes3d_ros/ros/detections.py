@@ -4,6 +4,7 @@ from typing import Any
 
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.summaries import modes_by_type
 from bayes3d_ros.ros.conversions import header, matrix_from_values, matrix_to_pose, pose_message
 
 try:
@@ -18,16 +19,23 @@ def detections_type() -> type | None:
 
 
 def detection_array(posterior: ScenePosterior, library: Library) -> Any:
-    """A detection per object; its results are the class posterior, every one with the pose and its covariance."""
+    """A detection per object. Its results are one hypothesis per type and mode of the pose given that type, with the
+    mode's pose and covariance and the score p(exists) p(type) p(mode), by which they are sorted."""
     models = {model.name: model for model in library.models}
     array = vision.Detection3DArray(header=header(posterior))
     for label, estimate in enumerate(posterior.objects, start=1):
-        pose = pose_message(estimate.position, estimate.orientation)
+        modes = modes_by_type(posterior.samples, posterior.object_index, posterior.types, label - 1)
         detection = vision.Detection3D(header=header(posterior), id=str(label))
-        for name, probability in estimate.type_probabilities.items():
+        hypotheses = [
+            (estimate.probability * probability * mode.weight, name, mode)
+            for name, probability in estimate.type_probabilities.items()
+            for mode in modes.get(name, ())
+        ]
+        for score, name, mode in sorted(hypotheses, key=lambda hypothesis: -hypothesis[0]):
             result = vision.ObjectHypothesisWithPose()
-            result.hypothesis.class_id, result.hypothesis.score = name, probability * estimate.probability
-            result.pose.pose, result.pose.covariance = pose, estimate.covariance.ravel().astype(float)
+            result.hypothesis.class_id, result.hypothesis.score = name, score
+            result.pose.pose = pose_message(mode.position, mode.orientation)
+            result.pose.covariance = mode.covariance.ravel().astype(float)
             detection.results.append(result)
         model = models[estimate.type]
         T_camera_box = matrix_from_values([*estimate.position, *estimate.orientation]) @ model.T_object_box

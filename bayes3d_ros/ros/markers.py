@@ -27,7 +27,7 @@ class SceneMarkers:
         """Markers of one scene; the first one deletes all that were shown before. Ids are labels.
 
         Namespaces: `voxels` (surface voxels), `names` (type and p(exists)), `uncertainty` (ellipsoid of two standard
-        deviations of the position).
+        deviations of the position), `modes` (voxels at the other modes of the pose, the lighter the fainter).
         """
         markers = [Marker(header=header(posterior), action=Marker.DELETEALL)]
         for label, estimate in enumerate(posterior.objects, start=1):
@@ -50,6 +50,11 @@ class SceneMarkers:
             for namespace, marker in (("voxels", voxels), ("names", name), ("uncertainty", spread)):
                 marker.header, marker.ns, marker.id, marker.action = header(posterior), namespace, label, Marker.ADD
                 markers.append(marker)
+            for mode in estimate.modes[1:]:
+                other = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.8 * mode.weight), scale=voxels.scale)
+                other.pose, other.points = pose_message(mode.position, mode.orientation), voxels.points
+                other.header, other.ns, other.id, other.action = header(posterior), "modes", len(markers), Marker.ADD
+                markers.append(other)
         return MarkerArray(markers=markers)
 
 

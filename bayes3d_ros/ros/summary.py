@@ -3,7 +3,7 @@
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
+from bayes3d_ros.model.posterior import ObjectEstimate, PoseMode, ScenePosterior
 from bayes3d_ros.ros.conversions import header
 
 
@@ -29,7 +29,7 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
 
 
 def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> DiagnosticStatus:
-    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    sigma_position, sigma_rotation = _sigmas(estimate.covariance)
     status = DiagnosticStatus(name=f"{label} {estimate.type}", hardware_id=frame_id)
     status.message = f"p(exists) {estimate.probability:.3f}"
     status.values = key_values(
@@ -37,11 +37,29 @@ def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> Diagn
         p_type=" ".join(f"{name}: {p:.3f}" for name, p in estimate.type_probabilities.items()),
         position_m=_numbers(estimate.position, 4),
         orientation_xyzw=_numbers(estimate.orientation, 4),
-        sigma_position_mm=_numbers(sigma[:3] * 1e3, 2),
-        sigma_rotation_deg=_numbers(np.degrees(sigma[3:]), 2),
+        sigma_position_mm=sigma_position,
+        sigma_rotation_deg=sigma_rotation,
         contact_face=str(estimate.contact_face),
+        p_face=" ".join(f"{face}: {p:.3f}" for face, p in enumerate(estimate.face_probabilities) if p >= 5e-4),
+        p_mode=" ".join(f"{k}: {mode.weight:.3f}" for k, mode in enumerate(estimate.modes, start=1)),
     )
+    if len(estimate.modes) > 1:  # else it is what stands above
+        status.values += [KeyValue(key=f"mode {k}", value=_mode(m)) for k, m in enumerate(estimate.modes, start=1)]
     return status
+
+
+def _mode(mode: PoseMode) -> str:
+    sigma_position, sigma_rotation = _sigmas(mode.covariance)
+    return (
+        f"p {mode.weight:.3f}, m {_numbers(mode.position, 4)}, xyzw {_numbers(mode.orientation, 4)}, "
+        f"sigma mm {sigma_position}, sigma deg {sigma_rotation}, face {mode.contact_face}"
+    )
+
+
+def _sigmas(covariance: np.ndarray) -> tuple[str, str]:
+    """Standard deviations in millimetres and degrees."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return _numbers(sigma[:3] * 1e3, 2), _numbers(np.degrees(sigma[3:]), 2)
 
 
 def _numbers(values: np.ndarray, digits: int) -> str:

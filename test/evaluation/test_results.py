@@ -16,6 +16,7 @@ KEYS = [
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
+    "face_probabilities", "modes",
 ]  # fmt: skip
 
 
@@ -46,6 +47,11 @@ def test_a_line_a_frame(written):
             assert list(entry) == OBJECT_KEYS
             np.testing.assert_allclose(entry["covariance"], found.covariance, rtol=1e-9)
             np.testing.assert_allclose(entry["position"], found.position, rtol=1e-9)
+            assert sum(entry["face_probabilities"]) == pytest.approx(1.0)
+            for mode, other in zip(entry["modes"], found.modes, strict=True):
+                assert list(mode) == ["weight", "position", "orientation", "covariance", "contact_face"]
+                assert mode["weight"] == pytest.approx(other.weight)
+                np.testing.assert_allclose(mode["covariance"], other.covariance, rtol=1e-9)
 
 
 def test_samples_are_the_posterior_rows_of_all_frames(written):

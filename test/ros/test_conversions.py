@@ -1,4 +1,6 @@
 import array
+import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from visualization_msgs.msg import Marker
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
 from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, summarise
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import conversions, detections
 from bayes3d_ros.ros.markers import SceneMarkers, ellipsoid
 from bayes3d_ros.ros.summary import summary_message
 
@@ -199,7 +201,60 @@ def test_the_summary_says_what_a_person_asks(library) -> None:
     assert values["ms"] == "250" and values["log evidence"] == "3.00" and "2: " in values["p n"]
     assert values["note"] == "table found in the depth"
     values = {v.key: v.value for v in message.status[1].values}
+    assert values["p face"] == "5: 1.000" and values["p mode"] == "1: 1.000" and "mode 1" not in values
     assert "brick: 1.000" in values["p type"] and len(values["sigma position mm"].split()) == 3
+
+
+def two_modes(names: tuple[str, ...]) -> ScenePosterior:
+    """The first object's pose has a second mode, turned by 180 degrees."""
+    posterior = scene(names)
+    first = posterior.objects[0]
+    (mode,) = first.modes
+    turned = mode._replace(weight=0.3, orientation=np.array([0.0, 0.0, 1.0, 0.0]))
+    changed = dataclasses.replace(first, modes=(mode._replace(weight=0.7), turned))
+    return dataclasses.replace(posterior, objects=(changed, *posterior.objects[1:]))
+
+
+def test_the_summary_and_the_markers_say_where_else_an_object_may_be(library) -> None:
+    posterior = two_modes(library.names)
+    values = {v.key: v.value for v in summary_message(posterior).status[1].values}
+    assert values["p mode"] == "1: 0.700 2: 0.300"
+    assert values["mode 2"].startswith("p 0.300, m -0.2") and "xyzw 0.0000 0.0000 1.0000 0.0000" in values["mode 2"]
+    (other,) = [m for m in SceneMarkers(library)(posterior).markers if m.ns == "modes"]
+    assert other.pose.orientation.z == 1.0 and other.color.a == pytest.approx(0.24)
+
+
+def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> None:
+    """vision_msgs may not be installed: its messages are stood in for by objects that take any field."""
+
+    class Message(SimpleNamespace):
+        def __getattr__(self, name: str):
+            value = [] if name in ("results", "detections") else Message()
+            setattr(self, name, value)
+            return value
+
+    kinds = ("Detection3DArray", "Detection3D", "ObjectHypothesisWithPose")
+    monkeypatch.setattr(detections, "vision", SimpleNamespace(**dict.fromkeys(kinds, Message)))
+    posterior = scene(library.names)
+    samples = posterior.samples
+    turned = samples.orientation.copy()
+    turned[:12, 0] = [0, 0, 1, 0]
+    kind = samples.type.copy()
+    kind[25:28, 0] = 1  # as well a cube
+    samples = samples._replace(orientation=turned, type=kind)
+    summary = summarise(samples, library.names, 0.5)
+    posterior = dataclasses.replace(
+        posterior, samples=samples, objects=summary.objects, object_index=summary.object_index
+    )
+    first, second = detections.detection_array(posterior, library).detections
+    scores = [result.hypothesis.score for result in first.results]
+    assert scores == sorted(scores, reverse=True)
+    assert sum(scores) == pytest.approx(posterior.objects[0].probability)
+    assert sorted(result.hypothesis.class_id for result in first.results) == ["brick", "brick", "cube"]
+    turns = sorted(abs(r.pose.pose.orientation.z) for r in first.results if r.hypothesis.class_id == "brick")
+    np.testing.assert_allclose(turns, [0, 1], atol=1e-9)
+    assert all(len(r.pose.covariance) == 36 for r in first.results)
+    assert len(second.results) == 1
 
 
 def test_the_library_message_lists_names() -> None:
