@@ -109,7 +109,7 @@ def pose_statistics(
     modes = tuple(mode._replace(weight=mode.weight / total) for mode in found)
     heaviest = modes[0]
     covariance = heaviest.covariance
-    if len(modes) > 1 or total < 1:
+    if len(modes) > 1 or (label < 0).any():
         covariance = second_moment(position, quaternion, weights, heaviest.position, heaviest.orientation)
     return PoseStatistics(heaviest.position, heaviest.orientation, covariance, modes)
 
