@@ -33,6 +33,14 @@ class Intrinsics:
             self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height
         )
 
+    def subsampled(self, width: int, height: int) -> "Intrinsics":
+        """The camera of the pixels that `resize_depth` picks. Where a picked pixel has no middle one to stand for (an
+        even factor), it lies half a source pixel beside the middle of its area: `resized` would put every ray there."""
+        rows, columns = _nearest((self.height, self.width), width, height)
+        sx, sy = width / self.width, height / self.height
+        u, v = np.mean(columns - np.arange(width) / sx), np.mean(rows - np.arange(height) / sy)
+        return Intrinsics(self.fx * sx, self.fy * sy, (self.cx - u) * sx, (self.cy - v) * sy, width, height)
+
     def rays(self) -> Float[np.ndarray, "height width 3"]:
         """The ray through every pixel centre, scaled so that its z is 1."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))

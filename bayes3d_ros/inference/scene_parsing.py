@@ -101,7 +101,7 @@ class SceneParser:
         settings = self.settings
         width = min(settings.score_width, frame.intrinsics.width)
         height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
-        camera = frame.intrinsics.resized(width, height)
+        camera = frame.intrinsics.subsampled(width, height)
         depth = resize_depth(frame.depth, width, height)
         with np.errstate(invalid="ignore"):
             returned = np.isfinite(depth) & (depth >= settings.near) & (depth <= settings.far)
