@@ -1,0 +1,176 @@
+"""A problem small enough to be sampled a thousand times, and its posterior as one set of weighted scenes.
+
+Two types, up to two objects, an image of 64 x 48; the model, the search and the sampler are those of the parser.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.evaluation.prior_predictive import DepthRange, draw_depth
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.inference import noise as noise_model
+from bayes3d_ros.inference import smc
+from bayes3d_ros.inference.coarse_to_fine import Context
+from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.scene_graph import Contact, Table
+from bayes3d_ros.model.scene_score import Image, add_objects, log_likelihood_scene, pad_scene
+
+CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
+DISTANCE, TILT = 0.6, np.pi / 4  # of the camera from the table's middle in metres, and of its view below the horizon
+VOXEL = 0.005
+SETTINGS = ParserSettings(
+    max_objects=2, count_ratio=1.0, table_width=0.3, table_depth=0.3, near=0.2, far=1.0, sigma_max=0.004, particles=192
+)
+
+
+class Problem(NamedTuple):
+    """What all scenes share."""
+
+    library: LibraryArrays
+    table: Table
+    blank: Image  # an image without depth
+    grid: NoiseGrid
+    limits: DepthRange
+    log_count: Float[np.ndarray, "M+1"]  # log P(n), n = 0..M, up to a constant
+    settings: ParserSettings
+
+
+class Samples(NamedTuple):
+    """The posterior as the mixture of all stages: S weighted scenes, each with a draw of the noise."""
+
+    number: Int[np.ndarray, "S"]  # of objects
+    objects: Contact  # [S, M]
+    sigma: Float[np.ndarray, "S"]
+    p_outlier: Float[np.ndarray, "S"]
+    log_likelihood: Float[np.ndarray, "S"]  # noise integrated out, up to a constant of the image
+    weight: Float[np.ndarray, "S"]  # sums to one
+    ess: tuple[float, ...]  # of every stage, a fraction
+
+
+def small_library() -> Library:
+    """A brick, which looks the same in four poses, and a mug without a bottom."""
+    wall, handle = trimesh.creation.annulus(0.028, 0.038, 0.09), trimesh.creation.box((0.03, 0.012, 0.05))
+    handle.apply_translation((0.05, 0, 0))
+    shapes = {"brick": trimesh.creation.box((0.05, 0.07, 0.10)), "mug": trimesh.util.concatenate([wall, handle])}
+    return Library(tuple(model_from_mesh(shape, name, VOXEL) for name, shape in shapes.items()))
+
+
+def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
+    """The library on a table seen from above by half a right angle."""
+    c, s = np.cos(TILT), np.sin(TILT)
+    T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, DISTANCE], [0, 0, 0, 1]])
+    rays = CAMERA.rays()
+    bare = T_camera_table[:3, 2] @ T_camera_table[:3, 3] / (rays @ T_camera_table[:3, 2])
+    limits = DepthRange(settings.near, settings.far)
+    blank = Image(
+        depth=jnp.zeros(bare.shape, jnp.float32),
+        kind=jnp.full(bare.shape, IN_WORKSPACE, jnp.int32),
+        ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
+        ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
+        focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
+        centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
+        table=jnp.asarray(bare, jnp.float32),
+        outlier_scale=jnp.float32(limits.outlier_scale),
+        front_margin=jnp.float32(3 * settings.sigma_max),
+    )
+    table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
+    log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
+    grid = noise_model.noise_grid(settings.sigma_max)
+    return Problem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
+
+
+def _table_size(settings: ParserSettings) -> tuple[float, float]:
+    return settings.table_width, settings.table_depth
+
+
+def render(objects: Contact, number: int, problem: Problem) -> Float[np.ndarray, "H W"]:
+    """Depth of the first `number` of objects [M] on the table, as the sampler draws it."""
+    half, (height, width) = problem.settings.window // 2, problem.blank.depth.shape
+    padded = _render(
+        objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window
+    )
+    return np.asarray(padded)[half : half + height, half : half + width]
+
+
+@partial(jax.jit, static_argnames="window")
+def _render(
+    objects: Contact, number: Int[Array, ""], blank: Image, library: LibraryArrays, table: Table, window: int
+) -> Float[Array, "Hp Wp"]:
+    scenes = pad_scene(blank.table, window)[None]
+    any_noise = Noise(jnp.ones(1), jnp.ones(1))
+    for m in range(objects.type.shape[0]):
+        one = jax.tree.map(lambda a, m=m: a[m][None], objects)
+        drawn = add_objects(one, scenes, blank, library, table, any_noise, window)[1]
+        scenes = jnp.where(m < number, drawn, scenes)
+    return scenes[0]
+
+
+def observe(
+    rng: np.random.Generator, surface: Float[np.ndarray, "H W"], noise: tuple[float, float], problem: Problem
+) -> Image:
+    """An image of rendered depth with noise (sigma, p_outlier), every pixel returned."""
+    rays = np.asarray(problem.blank.ray_x), np.asarray(problem.blank.ray_y)
+    depth = draw_depth(rng, surface, *rays, noise, problem.limits, problem.settings.window)
+    return problem.blank._replace(depth=jnp.asarray(depth, jnp.float32))
+
+
+def log_likelihood(surface: Float[np.ndarray, "H W"], image: Image, problem: Problem) -> float:
+    """log p(image | rendered depth), noise integrated out, with the constant of `Samples`."""
+    return float(_log_likelihood(jnp.asarray(surface), image, problem.grid, problem.settings.window))
+
+
+@partial(jax.jit, static_argnames="window")
+def _log_likelihood(surface: Float[Array, "H W"], image: Image, grid: NoiseGrid, window: int) -> Float[Array, ""]:
+    scenes = pad_scene(jnp.stack([image.table, surface]), window)
+    empty, table = log_likelihood_scene(scenes, image, grid.coarse, window)
+    return noise_model.log_marginal((table - empty.max())[None], grid)[0]
+
+
+_sample_noise = jax.jit(noise_model.sample)
+
+
+def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
+    """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
+    settings, context = problem.settings, Context(image, problem.library, problem.table)
+    state = smc.init(context, problem.grid, settings.particles, settings.max_objects, settings.window)
+    stages, ess = [], []
+    for number in range(settings.max_objects + 1):
+        if number:
+            state, info = smc.step(
+                jax.random.fold_in(key, number),
+                state,
+                jnp.int32(number - 1),
+                context,
+                problem.grid,
+                _table_size(settings),
+                settings.window,
+                settings.ess_threshold,
+            )
+            ess.append(float(info.ess))
+        noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, problem.grid)
+        log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
+        stages.append(
+            Samples(
+                number=np.full(settings.particles, number),
+                objects=state.objects,
+                sigma=noise.sigma,
+                p_outlier=noise.p_outlier,
+                log_likelihood=state.log_likelihood,
+                weight=log_weight,
+                ess=(),
+            )
+        )
+    mixture: Samples = jax.tree.map(lambda *parts: np.concatenate(parts), *jax.device_get(stages))
+    weight = np.exp(mixture.weight.astype(float) - mixture.weight.max())
+    return mixture._replace(weight=weight / weight.sum(), ess=tuple(ess))
