@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.inference.alignment import align
 from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, wrap
 from bayes3d_ros.inference.mode_search import Hypotheses, adapt, as_mixture, best_first, narrow, sharpen, take
-from bayes3d_ros.inference.noise import NoiseGrid, peak
+from bayes3d_ros.inference.noise import NoiseGrid, log_marginal, peak
 from bayes3d_ros.inference.sketch_search import (
     YAWS,
     Evidence,
@@ -168,8 +168,15 @@ def find_proposal(
         def exact(contact: Contact) -> Float[Array, "N"]:
             return _gains(contact, scene.depth, context, noise, window)
 
+        def marginal(contact: Contact) -> Float[Array, "N"]:
+            """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of
+            the image are compared by thousands of nats; at one noise level that comparison is off by ten."""
+            ancestor = jnp.zeros(contact.type.shape, jnp.int32)
+            gain = log_likelihood_gain(contact, ancestor, scene.depth[None], *context, grid.coarse, window)
+            return log_marginal(scene.table + gain, grid)
+
         modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
-        return adapt(adapt_key, as_mixture(modes, value), exact, library, table)
+        return adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
 
     def nothing() -> Modes:
         return as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))

@@ -16,6 +16,7 @@ Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
 _PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 5, 96, 0.25
 _INFLATION, _FLATTEN = 1.5, 4.0
+_PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
 
 
@@ -147,15 +148,14 @@ def adapt(
     def pilot(state: tuple) -> tuple:
         trial, _, modes, key = state
         key, draw_key = jax.random.split(key)
-        draws = draw_modes(draw_key, modes, _PILOT_DRAWS)
+        wide = modes._replace(scale=_PILOT_SCALE * modes.scale)
+        draws = draw_modes(draw_key, wide, _PILOT_DRAWS)
         log_weight = gains(draws) + log_prior(draws, library, table)
-        log_weight -= jax.nn.logsumexp(log_density_modes(draws, modes), 1)
+        log_weight -= jax.nn.logsumexp(log_density_modes(draws, wide), 1)
         log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
         ess = effective_fraction(log_weight)
         weight = _temper(log_weight[None], _PILOT_ESS * _PILOT_DRAWS)[0]
-        fitted = refit(draws, weight, modes)
-        kept = jax.tree.map(lambda new, old: jnp.where(ess < _PILOT_ESS, new, old), fitted, modes)
-        return trial + 1, ess, kept, key
+        return trial + 1, ess, refit(draws, weight, modes), key
 
     return jax.lax.while_loop(unfit, pilot, (0, jnp.float32(0.0), modes, key))[2]
 

@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise, Pixels, inlier_density, log_likelihood
+from bayes3d_ros.model.likelihood import (
+    BEYOND,
+    IN_WORKSPACE,
+    LATERAL,
+    NO_RETURN,
+    Noise,
+    Pixels,
+    inlier_density,
+    log_likelihood,
+)
 
 NEAR, FAR = 0.1, 5.0
 FOCAL = 60.0
@@ -38,19 +47,23 @@ def pad(rendered, window):
     return jnp.asarray(np.pad(rendered, [(half, half), (half, half), (0, 0)], constant_values=np.inf), jnp.float32)
 
 
-def full_density(rendered, depth, sigma):
-    """The mixture over all points of the image, one tile, float64: the docstring's formula, without a window."""
+def full_density(rendered, depth, sigma, window, lateral):
+    """The docstring's formula in float64, one tile; the Gaussian part of the weights has no window."""
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
     rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], -1)
-    points = (rendered[..., None] * rays)[np.isfinite(rendered)]
+    surface = np.isfinite(rendered)
+    points = (rendered[..., None] * rays)[surface]
+    place = np.argwhere(surface)
     out = np.empty(depth.shape)
     for v, u in np.ndindex(depth.shape):
         r = rays[v, u]
         norm = np.linalg.norm(r)
         along = points @ r / norm**2
         distance2 = (np.cross(points, r) ** 2).sum(-1) / norm**2
-        weight = np.exp(-(distance2 - distance2.min()) / (2 * sigma**2))
+        near = (np.abs(place - [v, u]) <= window // 2).all(-1)
+        weight = np.exp(-(distance2 - distance2[near].min(initial=1.0)) / (2 * sigma**2))
+        weight += lateral * near
         gauss = np.exp(-((depth[v, u] - along) ** 2) * norm**2 / (2 * sigma**2)) * norm / np.sqrt(2 * np.pi) / sigma
         out[v, u] = (weight * gauss).sum() / weight.sum()
     return out
@@ -81,12 +94,14 @@ def test_the_window_holds_the_full_sum(window, name):
     largest = window / 2 * 0.5 / FOCAL / 3
     for sigma in (0.0003, largest / 2, largest):
         depth = np.where(np.isfinite(rendered), rendered, 0.6) + sigma * rng.normal(0, 1.5, rendered.shape)
-        expected = full_density(rendered, depth, sigma)
-        got = density(pad(rendered[..., None], window), make_pixels(depth[..., None]), jnp.array([sigma]), window)
         seen = seen_in_window(rendered, window)
         assert seen.mean() > 0.9
         peak = 1 / np.sqrt(2 * np.pi) / sigma
-        assert np.abs(np.asarray(got)[0, ..., 0] - expected)[seen].max() / peak < 0.0015
+        image, pixels = pad(rendered[..., None], window), make_pixels(depth[..., None])
+        for lateral in (0.0, LATERAL):
+            expected = full_density(rendered, depth, sigma, window, lateral)
+            got = density(image, pixels, jnp.array([sigma]), window, lateral)
+            assert np.abs(np.asarray(got)[0, ..., 0] - expected)[seen].max() / peak < 0.0015
 
 
 def test_without_a_surface_a_return_is_an_outlier():
@@ -241,9 +256,8 @@ def test_outliers_side_by_side_in_a_long_range(near, far, depth):
 
 def test_returns_on_the_surface_at_the_smallest_noise():
     """Densities of 5e4 per metre: sigma_max may be as small as 0.1 mm."""
-    got = score(
-        jnp.full((4, 6, 1), 0.6), make_pixels(np.full((2, 4, 1), 0.6)), Noise(jnp.array([1e-5]), jnp.array([1e-3])), 3
-    )
-    rays = 1 + ((np.mgrid[:2, :4] - np.array([0.5, 1.5])[:, None, None]) / FOCAL) ** 2
-    norm = np.sqrt(rays.sum(0) - 1)
-    np.testing.assert_allclose(np.asarray(got), np.log(0.999 * norm / np.sqrt(2 * np.pi) / 1e-5).sum(), rtol=1e-4)
+    depth = np.full((2, 4), 0.6)
+    depth[0, 1] += 2e-5
+    got = score(pad(np.full((2, 4, 1), 0.6), 3), make_pixels(depth[..., None]), Noise(jnp.array([1e-5]), jnp.array([1e-3])), 3)
+    expected = np.log(0.999 * full_density(np.full((2, 4), 0.6), depth, 1e-5, 3, LATERAL)).sum()
+    np.testing.assert_allclose(np.asarray(got), expected, rtol=2e-4)
