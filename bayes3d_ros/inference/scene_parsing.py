@@ -14,6 +14,7 @@ from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, u
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
+from bayes3d_ros.inference.registration import SmoothError, draw_offsets
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
 from bayes3d_ros.model.library_arrays import library_arrays
@@ -33,6 +34,7 @@ class _Stage(NamedTuple):
     """What is kept of the scenes of k objects."""
 
     objects: Contact
+    offset: Float[np.ndarray, "N M 3"]  # of each object against its picture: x, y, yaw
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
@@ -51,6 +53,9 @@ class SceneParser:
         self._grid = noise_model.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
         self._sample_noise = jax.jit(noise_model.sample)
+        self._draw_offsets = jax.jit(draw_offsets, static_argnames="window")
+        bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
+        self._smooth_error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._cast = jax.jit(renderers["march"])
 
     def warm_up(self, width: int, height: int) -> None:
@@ -150,7 +155,7 @@ class SceneParser:
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
         state = smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
-        stages, ess = [self._keep(key, state)], []
+        stages, ess = [self._keep(key, state, context)], []
         log_mass = [0.0]
         for count in range(last):
             state, info = smc.step(
@@ -163,7 +168,7 @@ class SceneParser:
                 settings.window,
                 settings.ess_threshold,
             )
-            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), state))
+            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), state, context))
             ess.append(float(info.ess))
             log_mass.append(stages[-1].log_evidence + (count + 1) * np.log(settings.count_ratio))
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
@@ -174,12 +179,14 @@ class SceneParser:
             stages = stages[-1:]
         return stages, ess
 
-    def _keep(self, key: PRNGKeyArray, state: smc.State) -> _Stage:
+    def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context) -> _Stage:
         noise = self._sample_noise(key, state.table, self._grid)
-        objects, log_weight, noise, log_evidence = jax.device_get(
-            (state.objects, state.log_weight, noise, state.log_evidence)
+        error, window = self._smooth_error, self.settings.window
+        offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
+        objects, offset, log_weight, noise, log_evidence = jax.device_get(
+            (state.objects, offset, state.log_weight, noise, state.log_evidence)
         )
-        return _Stage(objects, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
+        return _Stage(objects, offset, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
 
     def _mix(self, stages: list[_Stage], table: Table) -> tuple[SceneSamples, float]:
         """The mixture over the number of objects, p(n | image) ~ P(n) Z_n, and log p(image) - log p(image | empty)."""
@@ -195,8 +202,15 @@ class SceneParser:
         log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
         log_weight -= np.logaddexp.reduce(log_weight)
         n = np.repeat(counts, [len(s.log_weight) for s in stages])
-        keep = log_weight > -30
+        keep = np.flatnonzero(log_weight > -30)
         objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
+        offset = np.concatenate([s.offset for s in stages])[keep]
+        if offset.any():  # each scene twice, with offsets of either sign: they leave means where they are
+            sign = np.resize([1.0, -1.0], 2 * len(keep))
+            keep, offset = np.repeat(keep, 2), np.repeat(offset, 2, 0) * sign[:, None, None]
+            objects = jax.tree.map(lambda a: np.repeat(a, 2, 0), objects)
+            x, y, yaw = objects.x + offset[..., 0], objects.y + offset[..., 1], objects.yaw + offset[..., 2]
+            objects = objects._replace(x=x, y=y, yaw=np.mod(yaw, 2 * np.pi))
         held = np.arange(objects.type.shape[1]) < n[keep, None]
         T = np.asarray(self._poses(objects, table))
         quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)

@@ -52,6 +52,15 @@ class ParserSettings:
     sigma_max: float = setting(
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
     )
+    depth_bias: float = setting(
+        0.0015, "standard deviation of depth errors that an object's pixels share", unit="m", low=0.0, high=0.05
+    )
+    depth_waviness: float = setting(
+        0.0017, "standard deviation of depth errors that are waves over an object", unit="m", low=0.0, high=0.05
+    )
+    waviness_length: float = setting(
+        0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
+    )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)

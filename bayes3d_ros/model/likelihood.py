@@ -3,7 +3,7 @@
 For a return z at a pixel with ray r (r_z = 1), and rendered points y_j r_j in the pixel's window at distance d_j from
 its ray,
 
-    p_out a(z) + (1 - p_out) sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),   w_j ~ exp(-d_j^2 / 2 sigma^2) + c,
+    p_out a(z) + (1 - p_out) sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),  w_j ~ exp(-d_j^2 / 2 sigma^2) + c,
 
 with the w_j normalised over the window's surface points and a(z) = 3 z^2 / (far^3 - near^3), the density of depth
 uniform in the frustum's volume. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's ray, so that it is a density

@@ -33,7 +33,7 @@ def test_picked_pixels_keep_their_rays(factor):
     ("width", "height", "off"), [(160, 120, 1e-5), (640, 480, 1e-5), (200, 150, 5e-3), (147, 113, 5e-3)]
 )
 def test_resized_points_stay_on_their_plane(width, height, off):
-    """To rounding for whole factors; for others each point is up to half a source pixel off, but not all to one side."""
+    """To rounding for whole factors; for others points are up to half a source pixel off, but not all to one side."""
     points = unproject(resize_depth(slanted(CAMERA), width, height), CAMERA.subsampled(width, height))
     distance = points @ [1.0, 2.0, 3.0] - 3
     assert np.abs(distance).max() < off

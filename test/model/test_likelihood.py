@@ -258,6 +258,7 @@ def test_returns_on_the_surface_at_the_smallest_noise():
     """Densities of 5e4 per metre: sigma_max may be as small as 0.1 mm."""
     depth = np.full((2, 4), 0.6)
     depth[0, 1] += 2e-5
-    got = score(pad(np.full((2, 4, 1), 0.6), 3), make_pixels(depth[..., None]), Noise(jnp.array([1e-5]), jnp.array([1e-3])), 3)
-    expected = np.log(0.999 * full_density(np.full((2, 4), 0.6), depth, 1e-5, 3, LATERAL)).sum()
+    rendered, noise = np.full((2, 4), 0.6), Noise(jnp.array([1e-5]), jnp.array([1e-3]))
+    got = score(pad(rendered[..., None], 3), make_pixels(depth[..., None]), noise, 3)
+    expected = np.log(0.999 * full_density(rendered, depth, 1e-5, 3, LATERAL)).sum()
     np.testing.assert_allclose(np.asarray(got), expected, rtol=2e-4)

@@ -23,7 +23,11 @@ from bayes3d_ros.model.posterior import ParseError, ScenePosterior
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
 # Every scene is parsed with each of these.
-NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (("independent pixels", ParserSettings()),)
+NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
+    ("independent pixels", ParserSettings(depth_bias=0.0, depth_waviness=0.0)),
+    ("offset an object", ParserSettings(depth_waviness=0.0)),
+    ("smooth field", ParserSettings()),
+)
 TYPES: tuple[str, ...] = tuple(SYMMETRIES)
 SCENES, QUICK_SCENES = 400, 40
 NEAR = 0.1  # metres: an estimate farther off is another thing's
