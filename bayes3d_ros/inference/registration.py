@@ -29,7 +29,8 @@ _POINTS = 48  # of an object's sketch
 _BEHIND = 0.01  # metres behind what is seen in front, from which a point is hidden
 _HELD = 0.03  # share of the visible points by which outlines, which the field does not move, hold an object
 _ARM = 0.03  # metres, of the yaw that outlines hold
-_OUTLINE = 0.1  # scored pixels, how far off an outline may be
+_OUTLINE = 0.1  # scored pixels, how far off an outline may be that is seen all around; the less is seen, the farther
+_SMALLEST_SHARE = 0.05
 
 
 class SmoothError(NamedTuple):
@@ -59,7 +60,8 @@ def offset_covariance(
     u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
     front = scenes[jnp.arange(len(scenes))[:, None, None], v + half, u + half]
     cosine = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
-    seen = inside & (cosine > 0.1) & (p[..., 2] < front + _BEHIND) & (image.kind[v, u] != NO_RETURN)
+    facing = cosine > 0.1
+    seen = inside & facing & (p[..., 2] < front + _BEHIND) & (image.kind[v, u] != NO_RETURN)
     R, origin = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     centre = objects.x[..., None] * R[:, 0] + objects.y[..., None] * R[:, 1] + origin
     turn = jnp.cross(R[:, 2], p - centre[..., None, :])
@@ -70,8 +72,9 @@ def offset_covariance(
     apart = ((p[..., :, None, :] - p[..., None, :, :]) ** 2).sum(-1)
     field = error.bias**2 + error.waviness**2 * jnp.exp(-0.5 * apart / error.length**2)
     smooth = jnp.einsum("nmap,nmpq,nmbq->nmab", gain, field, gain)
-    pixel = T[..., 0, 2, 3] / image.focal[0]
-    outline = (_OUTLINE * pixel[..., None, None]) ** 2 * jnp.diag(jnp.array([1.0, 1.0, 1 / (2 * _ARM) ** 2]))
+    share = seen.sum(-1) / jnp.maximum(facing.sum(-1), 1)
+    off = _OUTLINE * T[..., 0, 2, 3] / image.focal[0] / jnp.maximum(share, _SMALLEST_SHARE)
+    outline = off[..., None, None] ** 2 * jnp.diag(jnp.array([1.0, 1.0, 1 / (2 * _ARM) ** 2]))
     return smooth + jnp.where((error.bias > 0) | (error.waviness > 0), outline, 0.0)
 
 
@@ -87,3 +90,10 @@ def draw_offsets(
     value, along = jnp.linalg.eigh(offset_covariance(objects, scenes, context, error, window))
     gauss = jax.random.normal(key, value.shape) * jnp.sqrt(jnp.maximum(value, 0.0))
     return jnp.einsum("nmab,nmb->nma", along, gauss)
+
+
+def draw_table_errors(
+    key: PRNGKeyArray, count: int, height: Float[Array, ""], tilt: Float[Array, ""]
+) -> Float[Array, "N 3"]:
+    """Tilts about the table's x and y (radians) and height (metres) of the true plane against the one taken for it."""
+    return jnp.stack([tilt, tilt, height]) * jax.random.normal(key, (count, 3))

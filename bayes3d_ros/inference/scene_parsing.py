@@ -14,7 +14,7 @@ from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, u
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
-from bayes3d_ros.inference.registration import SmoothError, draw_offsets
+from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
 from bayes3d_ros.model.library_arrays import library_arrays
@@ -35,6 +35,7 @@ class _Stage(NamedTuple):
 
     objects: Contact
     offset: Float[np.ndarray, "N M 3"]  # of each object against its picture: x, y, yaw
+    plane: Float[np.ndarray, "N 3"]  # the table against the plane taken for it: two tilts, height
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
@@ -54,6 +55,7 @@ class SceneParser:
         self._table_size = (settings.table_width, settings.table_depth)
         self._sample_noise = jax.jit(noise_model.sample)
         self._draw_offsets = jax.jit(draw_offsets, static_argnames="window")
+        self._draw_table_errors = jax.jit(draw_table_errors, static_argnames="count")
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._smooth_error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._cast = jax.jit(renderers["march"])
@@ -183,10 +185,12 @@ class SceneParser:
         noise = self._sample_noise(key, state.table, self._grid)
         error, window = self._smooth_error, self.settings.window
         offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
-        objects, offset, log_weight, noise, log_evidence = jax.device_get(
-            (state.objects, offset, state.log_weight, noise, state.log_evidence)
+        height, tilt = jnp.float32(self.settings.table_height_sigma), jnp.float32(self.settings.table_tilt_sigma)
+        plane = self._draw_table_errors(jax.random.fold_in(key, 2), len(state.log_weight), height, tilt)
+        objects, offset, plane, log_weight, noise, log_evidence = jax.device_get(
+            (state.objects, offset, plane, state.log_weight, noise, state.log_evidence)
         )
-        return _Stage(objects, offset, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
+        return _Stage(objects, offset, plane, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
 
     def _mix(self, stages: list[_Stage], table: Table) -> tuple[SceneSamples, float]:
         """The mixture over the number of objects, p(n | image) ~ P(n) Z_n, and log p(image) - log p(image | empty)."""
@@ -205,14 +209,16 @@ class SceneParser:
         keep = np.flatnonzero(log_weight > -30)
         objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
         offset = np.concatenate([s.offset for s in stages])[keep]
-        if offset.any():  # each scene twice, with offsets of either sign: they leave means where they are
+        plane = np.concatenate([s.plane for s in stages])[keep]
+        if offset.any() or plane.any():  # each scene twice, with errors of either sign: means stay where they are
             sign = np.resize([1.0, -1.0], 2 * len(keep))
             keep, offset = np.repeat(keep, 2), np.repeat(offset, 2, 0) * sign[:, None, None]
+            plane = np.repeat(plane, 2, 0) * sign[:, None]
             objects = jax.tree.map(lambda a: np.repeat(a, 2, 0), objects)
             x, y, yaw = objects.x + offset[..., 0], objects.y + offset[..., 1], objects.yaw + offset[..., 2]
             objects = objects._replace(x=x, y=y, yaw=np.mod(yaw, 2 * np.pi))
         held = np.arange(objects.type.shape[1]) < n[keep, None]
-        T = np.asarray(self._poses(objects, table))
+        T = self._poses(objects, table, plane)
         quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
         samples = SceneSamples(
             log_weight=(log_weight[keep] - np.logaddexp.reduce(log_weight[keep])).astype(np.float32),
@@ -226,7 +232,9 @@ class SceneParser:
         )
         return samples, float(log_evidence)
 
-    def _poses(self, objects: Contact, table: Table) -> Float[np.ndarray, "S M 4 4"]:
+    def _poses(
+        self, objects: Contact, table: Table, plane: Float[np.ndarray, "S 3"]
+    ) -> Float[np.ndarray, "S M 4 4"]:
         """T_camera_object in float64 numpy: sample counts differ from frame to frame, and must not recompile."""
         T_contact = np.asarray(self._arrays.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
         slide = np.zeros((*objects.type.shape, 4, 4))
@@ -234,7 +242,10 @@ class SceneParser:
         slide[..., 0, 0], slide[..., 0, 1], slide[..., 1, 0], slide[..., 1, 1] = c, -s, s, c
         slide[..., 2, 2] = slide[..., 3, 3] = 1
         slide[..., 0, 3], slide[..., 1, 3] = objects.x, objects.y
-        return np.asarray(table.T_camera_table, np.float64) @ slide @ T_contact
+        moved = np.broadcast_to(np.eye(4), (len(plane), 1, 4, 4)).copy()
+        moved[:, 0, :3, :3] = Rotation.from_rotvec(plane * [1, 1, 0]).as_matrix()
+        moved[:, 0, 2, 3] = plane[:, 2]
+        return np.asarray(table.T_camera_table, np.float64) @ moved @ slide @ T_contact
 
     def _reconstruct(self, frame, T_camera_table, samples, summary):
         """Depth and labels of the best scene at the input's size, drawn by the model's own renderer."""

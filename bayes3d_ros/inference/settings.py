@@ -61,6 +61,12 @@ class ParserSettings:
     waviness_length: float = setting(
         0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
     )
+    table_height_sigma: float = setting(
+        0.0007, "standard deviation of the table's height about the plane given or found", unit="m", low=0.0, high=0.05
+    )
+    table_tilt_sigma: float = setting(
+        0.002, "standard deviation of the table's two tilts about that plane", unit="rad", low=0.0, high=0.2
+    )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)

@@ -24,7 +24,10 @@ __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
 # Every scene is parsed with each of these.
 NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
-    ("independent pixels", ParserSettings(depth_bias=0.0, depth_waviness=0.0)),
+    (
+        "independent pixels",
+        ParserSettings(depth_bias=0.0, depth_waviness=0.0, table_height_sigma=0.0, table_tilt_sigma=0.0),
+    ),
     ("offset an object", ParserSettings(depth_waviness=0.0)),
     ("smooth field", ParserSettings()),
 )
