@@ -14,7 +14,7 @@ from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
 
 Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
-_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 5, 96, 0.25
+_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
 _INFLATION, _FLATTEN = 1.5, 4.0
 _PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
