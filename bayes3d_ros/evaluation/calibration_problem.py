@@ -20,11 +20,11 @@ from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import IN_WORKSPACE
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.scene_graph import Contact, Table
-from bayes3d_ros.model.scene_score import Image, add_objects, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import Image, draw_objects, log_likelihood_scene, pad_scene
 
 CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 DISTANCE, TILT = 0.6, np.pi / 4  # of the camera from the table's middle in metres, and of its view below the horizon
@@ -108,10 +108,9 @@ def _render(
     objects: Contact, number: Int[Array, ""], blank: Image, library: LibraryArrays, table: Table, window: int
 ) -> Float[Array, "Hp Wp"]:
     scenes = pad_scene(blank.table, window)[None]
-    any_noise = Noise(jnp.ones(1), jnp.ones(1))
     for m in range(objects.type.shape[0]):
         one = jax.tree.map(lambda a, m=m: a[m][None], objects)
-        drawn = add_objects(one, scenes, blank, library, table, any_noise, window)[1]
+        drawn = draw_objects(one, scenes, blank, library, table, window)
         scenes = jnp.where(m < number, drawn, scenes)
     return scenes[0]
 

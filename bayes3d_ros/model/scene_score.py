@@ -175,40 +175,26 @@ def log_likelihood_gain(
     return _over_tiles(add, gains, contact, image, library, table, half)
 
 
-def add_objects(
+def draw_objects(
     contact: Contact,
     scenes: Float[Array, "N Hp Wp"],
     image: Image,
     library: LibraryArrays,
     table: Table,
-    noise: Noise,
     window: int,
-) -> tuple[Float[Array, "N S P"], Float[Array, "N Hp Wp"], Int[Array, "N"]]:
-    """Scene n with object n rendered into it: the gain as in `log_likelihood_gain`, the new depth, and the number of
-    pixels that the object would cover alone in the image."""
+) -> Float[Array, "N Hp Wp"]:
+    """Scene n with object n rendered into it."""
     half = window // 2
-    side = TILE + 2 * half
     height, width = image.depth.shape
 
-    def draw(state, n, u, v, depth, real):
-        gains, drawn, covered = state
-        pixels = _observed(image, u, v)
-        before = _crop(scenes, n, u, v, side)
-        gain = log_likelihood(jnp.minimum(before, depth), pixels, noise, window)
-        gain -= log_likelihood(before, pixels, noise, window)
+    def draw(drawn, n, u, v, depth, real):
         step = jnp.arange(TILE)[:, None]
         rows, columns = (v + step)[:, None], u + step
         inside = real & (rows < height) & (columns < width)
         depth = jnp.where(inside, depth[half : half + TILE, half : half + TILE], jnp.inf)
-        return (
-            gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1)),
-            drawn.at[n, half + rows, half + columns].min(depth),
-            covered.at[n].add(jnp.isfinite(depth).sum((0, 1))),
-        )
+        return drawn.at[n, half + rows, half + columns].min(depth)
 
-    gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    start = (gains, scenes, jnp.zeros(contact.type.shape, jnp.int32))
-    return _over_tiles(draw, start, contact, image, library, table, half)
+    return _over_tiles(draw, scenes, contact, image, library, table, half)
 
 
 def halved(image: Image) -> Image:
