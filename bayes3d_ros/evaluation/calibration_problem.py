@@ -20,7 +20,7 @@ from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, Likelihood, Noise
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.scene_graph import Contact, Table
@@ -83,6 +83,7 @@ def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
         table=jnp.asarray(bare, jnp.float32),
         outlier_scale=jnp.float32(limits.outlier_scale),
         front_margin=jnp.float32(3 * settings.sigma_max),
+        likelihood=Likelihood(settings.likelihood),
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)

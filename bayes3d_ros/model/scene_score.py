@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.likelihood import NO_RETURN, Noise, Pixels, log_likelihood
+from bayes3d_ros.model.likelihood import NO_RETURN, Likelihood, Noise, Pixels, log_likelihood
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
 
@@ -32,6 +32,7 @@ class Image(NamedTuple):
     table: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
     outlier_scale: Float[Array, ""]
     front_margin: Float[Array, ""]
+    likelihood: Likelihood = Likelihood()  # what is scored
 
 
 def border(window: int) -> tuple[int, int]:
@@ -144,6 +145,7 @@ def _observed(image: Image, u, v) -> Pixels:
         step_y=1 / image.focal[1],
         outlier_scale=image.outlier_scale,
         front_margin=image.front_margin,
+        likelihood=image.likelihood,
     )
 
 
@@ -242,6 +244,7 @@ def log_likelihood_scene(
         step_y=1 / image.focal[1],
         outlier_scale=image.outlier_scale,
         front_margin=image.front_margin,
+        likelihood=image.likelihood,
     )
 
     def one(scene: Float[Array, "Hp Wp"]) -> Float[Array, "S P"]:
