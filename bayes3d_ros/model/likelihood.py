@@ -150,7 +150,10 @@ def log_likelihood(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
 ) -> Float[Array, "S P T"]:
     """Sum over the pixels of each tile of the log likelihood, for every pair of noise values. Their number is a
-    multiple of four; `rendered` has a border of window // 2 pixels around."""
+    multiple of four; `rendered` has a border of window // 2 pixels around. Of free points a pixel may hold several:
+    then `pixels` has L times the tiles of `rendered`, all tiles of one layer after those of the other."""
+    layers = pixels.depth.shape[-1] // rendered.shape[-1]
+    rendered = jnp.concatenate([rendered] * layers, -1) if layers > 1 else rendered
     half = window // 2
     height, width = pixels.depth.shape[:2]
     a = outlier_density(pixels)
@@ -162,7 +165,9 @@ def log_likelihood(
     outlier = jnp.where(pixels.kind == NO_RETURN, 1.0, a)
     tiles = outlier.shape[-1]
     at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
-    return _sum_log(outlier.reshape(-1, tiles), inlier.reshape(inlier.shape[0], -1, tiles), noise.p_outlier, at_once)
+    inlier = inlier.reshape(inlier.shape[0], -1, tiles)
+    total = _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
+    return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
 
 
 def _sum_log(
