@@ -156,18 +156,22 @@ def _observed(image: Image, u, v, shape=(TILE, TILE)) -> Pixels:
         front_margin=image.front_margin,
         likelihood=image.likelihood,
     )
-    if image.points is None:
-        return pixels
+    return pixels if image.points is None else _observed_points(image.points, pixels, rows, columns, inside)
 
-    def layers(a: Array) -> Array:
-        return jnp.concatenate([a] * image.points.depth.shape[0] if a.ndim == 3 else list(a), -1)
 
-    depth, kind, x, y = (layers(a[:, rows, columns]) for a in image.points)
+def _observed_points(points: FreePoints, pixels: Pixels, rows, columns, inside) -> Pixels:
+    """Free points in place of the depth of these pixels, layer after layer."""
+    count = points.depth.shape[0]
+
+    def in_every_layer(a: Array) -> Array:
+        return jnp.concatenate([a] * count, -1)
+
+    depth, kind, x, y = (jnp.concatenate(list(a[:, rows, columns]), -1) for a in points)
     return pixels._replace(
         depth=depth,
-        kind=jnp.where(layers(inside), kind, NO_RETURN),
-        ray_x=layers(pixels.ray_x),
-        ray_y=layers(pixels.ray_y),
+        kind=jnp.where(in_every_layer(inside), kind, NO_RETURN),
+        ray_x=in_every_layer(pixels.ray_x),
+        ray_y=in_every_layer(pixels.ray_y),
         beside=(x, y),
     )
 

@@ -1,4 +1,4 @@
-"""The paper's likelihood of free points: against the full sum in float64, as a density of points, and beside `depth`."""
+"""The paper's likelihood of free points: the full sum in float64, the density of points, and `depth` beside it."""
 
 from dataclasses import fields
 
@@ -165,7 +165,8 @@ def test_on_depth_images_points_are_too_sure_of_the_noise(sigma):
     norm = np.linalg.norm(rays(side, side, focal), axis=-1)
     rendered = 0.6 / (1 + 0.2 * rays(side, side, focal)[..., 0])
     depth = (rendered + sigma / norm * rng.normal(size=rendered.shape))[..., None]
-    found = {name: best_sigma(rendered, make_pixels(depth, likelihood=name, focal=focal), sigma) for name in likelihoods}
+    pixels = {name: make_pixels(depth, likelihood=name, focal=focal) for name in likelihoods}
+    found = {name: best_sigma(rendered, seen, sigma) for name, seen in pixels.items()}
     assert found["depth"] == pytest.approx(sigma, rel=0.05)
     assert found["points"] == pytest.approx(sigma / np.sqrt(3), rel=0.05)
 

@@ -198,6 +198,7 @@ def test_gain_of_free_points_is_the_difference_of_whole_clouds(contacts, drawn, 
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
     gain = np.asarray(gain_of(contacts, jnp.asarray(ancestor), scenes, cloud, arrays, table, NOISE, WINDOW))
     after = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], drawn)), WINDOW)
-    expected = np.asarray(whole(after, cloud, NOISE, WINDOW)) - np.asarray(whole(scenes, cloud, NOISE, WINDOW))[ancestor]
+    before = np.asarray(whole(scenes, cloud, NOISE, WINDOW))[ancestor]
+    expected = np.asarray(whole(after, cloud, NOISE, WINDOW)) - before
     assert np.ptp(expected[:, 0, 0]) > 100
     np.testing.assert_allclose(gain, expected, atol=0.02, rtol=1e-5)
