@@ -1,4 +1,4 @@
-"""The model run forwards: scenes and noise from the prior, depth images or free points from the likelihood's density."""
+"""The model run forwards: scenes and noise from the prior, images or free points from the likelihood's own density."""
 
 from functools import partial
 from typing import NamedTuple
