@@ -14,8 +14,9 @@ from scipy.interpolate import CubicSpline
 
 from bayes3d_ros.model.likelihood import Noise
 
-_SIGMA_STEPS, _P_STEPS = 11, 13  # coarse grid: sigma_max 2^(-k/3), logit p
-_SIGMA_FINE, _P_FINE = 16, 16  # fine points between coarse ones
+# Coarse grid: sigma_max 2^(-k/3), logit p. Each sigma costs a pass over the window, a p next to nothing.
+_SIGMA_STEPS, _P_STEPS = 11, 17
+_SIGMA_FINE, _P_FINE = 32, 12  # fine points between coarse ones: 0.7 % of sigma, whose posterior may be as narrow
 _P_LOW, _P_HIGH = 2e-4, 0.9
 
 

@@ -24,7 +24,7 @@ from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain, log
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
 _LAST_FLOOR = 0.02
-_MOVES = 2  # after a resampling: an independent draw, then a walk, in turn
+_MOVES = 2  # once resampled at the target: a fresh draw and a walk; on the way there one of them, in turn
 
 
 class State(NamedTuple):
@@ -129,7 +129,12 @@ def step(
     end, log_weight, log_evidence, ess = _anneal(
         anneal_key, start, log_weight, exponents, extend, proposal, context, ess_threshold
     )
-    alone = _gain_alone(end.new, state.alone[end.ancestor], count, context, grid, window)
+    alone = state.alone[end.ancestor]
+    alone = jax.lax.cond(
+        count == 0,
+        lambda: alone.at[:, 0].set(end.log_likelihood - state.log_likelihood[end.ancestor]),
+        lambda: _gain_alone(end.new, alone, count, context, grid, window),
+    )
     log_weight, last = _normalised(log_weight + _log_last(alone, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
@@ -176,9 +181,10 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
 
         def move(number: Array, extended: _Extended) -> _Extended:
             move_key = jax.random.fold_in(level_key, number)
-            return _move(move_key, extended, c, number % 2 == 0, extend, proposal, context)
+            return _move(move_key, extended, c, (level + number) % 2 == 0, extend, proposal, context)
 
-        extended = jax.lax.fori_loop(0, jnp.where(few & jnp.isfinite(gained), _MOVES, 0), move, extended)
+        moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
+        extended = jax.lax.fori_loop(0, moves, move, extended)
         return level + 1, c, extended, log_weight, log_evidence + gained, jnp.minimum(ess, now)
 
     first = (jnp.int32(0), jnp.float32(0.0), start, log_weight, jnp.float32(0.0), jnp.float32(1.0))
@@ -205,8 +211,7 @@ def _gain_alone(
     """Nats that the new object, slot `count`, gains over the empty table."""
     empty = empty_table(context, grid, window)
     gain = log_likelihood_gain(new, jnp.zeros_like(new.type), empty.scene, *context, grid.coarse, window)
-    gain = noise_model.log_marginal(empty.table + gain, grid) - empty.log_likelihood
-    return alone.at[:, count].set(gain)
+    return alone.at[:, count].set(noise_model.log_marginal(empty.table + gain, grid) - empty.log_likelihood)
 
 
 def _log_last(alone: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
