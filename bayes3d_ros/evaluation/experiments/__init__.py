@@ -11,6 +11,7 @@ Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
 EXPERIMENTS: dict[str, str] = {
     "calibration": "bayes3d_ros.evaluation.experiments.calibration",
     "coverage": "bayes3d_ros.evaluation.experiments.coverage",
+    "exactness": "bayes3d_ros.evaluation.experiments.exactness",
     "parsing": "bayes3d_ros.evaluation.experiments.parsing",
 }
 

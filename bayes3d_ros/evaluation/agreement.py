@@ -1,0 +1,35 @@
+"""How far a sampled distribution is from an exact one, and how far it may be by chance."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+
+def total_variation(p: Sequence[float] | np.ndarray, q: Sequence[float] | np.ndarray) -> float:
+    """Half the sum of absolute differences, in [0, 1]."""
+    return float(0.5 * np.abs(np.asarray(p, float) - np.asarray(q, float)).sum())
+
+
+def noise_floor(p: Sequence[float] | np.ndarray, ess: float, quantile: float = 0.95, draws: int = 2000) -> float:
+    """The total variation from p that ESS independent draws from p stay below with probability `quantile`, simulated.
+
+    A quantile, not the mean: where the mass lies in two bins the mean is exceeded by half in one case of four.
+    """
+    probability = np.asarray(p, float)
+    count = max(1, round(ess))
+    counts = np.random.default_rng(0).multinomial(count, probability / probability.sum(), draws)
+    return float(np.quantile(0.5 * np.abs(counts / count - probability).sum(1), quantile))
+
+
+def ratio_and_error(log_estimates: Sequence[float] | np.ndarray, log_truth: float) -> tuple[float, float]:
+    """Mean of Z_hat / Z over runs and its standard error."""
+    ratio = np.exp(np.asarray(log_estimates, float) - log_truth)
+    return float(ratio.mean()), float(ratio.std(ddof=1) / np.sqrt(len(ratio)))
+
+
+def evidence_weights(log_estimates: Sequence[float] | np.ndarray) -> Float[np.ndarray, "R"]:
+    """Runs weighted by their Z_hat: their mixture is the posterior on average, that of equal weights is not."""
+    log_z = np.asarray(log_estimates, float)
+    weight = np.exp(log_z - log_z.max())
+    return weight / weight.sum()

@@ -1,0 +1,203 @@
+"""The sampler against exhaustive enumeration: evidence, marginals and the number of objects on small problems."""
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.evaluation.agreement import evidence_weights, noise_floor, ratio_and_error, total_variation
+from bayes3d_ros.evaluation.exact_reference import (
+    Marginals,
+    enumerate_apart,
+    enumerate_object,
+    marginals,
+    neglected,
+)
+from bayes3d_ros.evaluation.experiments import Row
+from bayes3d_ros.evaluation.experiments.exactness_plot import plot
+from bayes3d_ros.evaluation.small_problems import PROBLEMS, Problem
+from bayes3d_ros.inference import smc
+from bayes3d_ros.model.scene_graph import Contact
+
+__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+
+PARTICLES, ESS_THRESHOLD = 1000, 0.5
+SEEDS, QUICK_SEEDS = 50, 8
+QUICK_PROBLEMS = ("handle seen", "handle hidden")
+QUANTITIES = ("type", "face", "yaw")
+HEADER = (
+    f"{'problem':<14} {'seed':>5} {'log Z':>9} {'- exact':>8} {'ESS':>6}   "
+    "total variation (and 1.5 x what chance allows) of yaw, type, face"
+)
+
+
+class Run(NamedTuple):
+    """One run of the sampler."""
+
+    log_evidence: tuple[float, ...]  # of 0, 1, .. objects
+    contact: Contact  # [N, k], scenes of the most objects
+    weight: Float[np.ndarray, "N"]  # sums to one
+    ess: float  # of those, not divided by N
+
+
+def run(problem: Problem, seed: int, particles: int = PARTICLES) -> Run:
+    """As many stages as the problem has true objects."""
+    objects, key = len(problem.truth.type), jax.random.key(seed)
+    state = smc.init(problem.context, problem.grid, particles, problem.max_objects, problem.window)
+    log_evidence = [0.0]
+    for count in range(objects):
+        state, _ = smc.step(
+            jax.random.fold_in(key, count), state, jnp.int32(count), problem.context, problem.grid,
+            problem.table_size, problem.window, ESS_THRESHOLD,
+        )  # fmt: skip
+        log_evidence.append(float(state.log_evidence))
+    weight = np.exp(np.asarray(state.log_weight, np.float64))
+    contact: Contact = jax.tree.map(lambda a: np.asarray(a)[:, :objects], state.objects)
+    return Run(tuple(log_evidence), contact, weight / weight.sum(), float(weight.sum() ** 2 / (weight**2).sum()))
+
+
+def run_marginals(problem: Problem, result: Run) -> Marginals:
+    """Of an object of the scenes chosen at random."""
+    objects = result.contact.type.shape[1]
+    return marginals(problem, jax.tree.map(np.ravel, result.contact), np.repeat(result.weight, objects))
+
+
+def number_of_objects(log_evidence: Sequence[float], count_ratio: float) -> Float[np.ndarray, "n"]:
+    """p(n | image) for a prior that stops at the most objects that log_evidence knows of."""
+    log_p = np.asarray(log_evidence) + np.arange(len(log_evidence)) * np.log(count_ratio)
+    return np.exp(log_p - np.logaddexp.reduce(log_p))
+
+
+def notes(quick: bool) -> list[str]:
+    """Says what a quick run leaves out."""
+    if not quick:
+        return []
+    return [f"quick: {', '.join(QUICK_PROBLEMS)} only, {QUICK_SEEDS} seeds in place of {SEEDS}"]
+
+
+def _names(quick: bool) -> tuple[str, ...]:
+    return QUICK_PROBLEMS if quick else tuple(PROBLEMS)
+
+
+def count(quick: bool) -> int:
+    """Every problem is enumerated, then sampled with every seed."""
+    return len(_names(quick)) * (1 + (QUICK_SEEDS if quick else SEEDS))
+
+
+def steps(quick: bool) -> Iterator[list[Row]]:
+    """One row for the enumeration of a problem, then one for every seed."""
+    for name in _names(quick):
+        problem = PROBLEMS[name]()
+        exact = reference_row(problem)
+        yield [exact]
+        for seed in range(QUICK_SEEDS if quick else SEEDS):
+            yield [seed_row(problem, exact, seed)]
+
+
+def reference_row(problem: Problem) -> Row:
+    """The enumeration of a problem."""
+    start = time.perf_counter()
+    row: Row = {"what": "reference", "problem": problem.name}
+    if len(problem.truth.type) == 1:
+        found = enumerate_object(problem)
+        fine, half = [0.0, found.log_evidence[-1]], [0.0, found.log_evidence[-2]]
+        said = found.marginals(problem)
+        row |= {"cells": len(found.cells.log_value), "neglected": 0.0}
+    else:
+        both = enumerate_apart(problem)
+        fine, half, said = [0.0, *both.log_evidence], [0.0, *both.log_evidence_half], both.marginals
+        row |= {"cells": both.cells, "neglected": round(neglected(problem), 9)}
+    return row | {
+        "log_evidence": [round(z, 5) for z in fine],
+        "halving_moves": [round(a - b, 5) for a, b in zip(fine, half, strict=True)],
+        "count_ratio": problem.count_ratio,
+        "num_objects": _rounded(number_of_objects(fine, problem.count_ratio)),
+        "marginals": {name: _rounded(values) for name, values in said._asdict().items()},
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+
+
+def seed_row(problem: Problem, exact: Row, seed: int) -> Row:
+    """One run of the sampler, compared with the enumeration."""
+    start = time.perf_counter()
+    result = run(problem, seed)
+    seconds = time.perf_counter() - start
+    said = run_marginals(problem, result)._asdict()
+    row: Row = {
+        "what": "seed",
+        "problem": problem.name,
+        "seed": seed,
+        "log_evidence": [round(z, 5) for z in result.log_evidence],
+        "error": round(result.log_evidence[-1] - exact["log_evidence"][-1], 5),
+        "ess": round(result.ess, 2),
+        "num_objects": _rounded(number_of_objects(result.log_evidence, problem.count_ratio)),
+        "marginals": {name: _rounded(values) for name, values in said.items()},
+        "seconds": round(seconds, 3),
+    }
+    for name in QUANTITIES:
+        row[f"tv_{name}"] = round(total_variation(said[name], exact["marginals"][name]), 5)
+        row[f"limit_{name}"] = round(1.5 * noise_floor(exact["marginals"][name], result.ess), 5)
+    return row
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(v), 6) for v in values]
+
+
+def line(row: Row) -> str:
+    """A row, under HEADER."""
+    if row["what"] == "reference":
+        moved = max(abs(m) for m in row["halving_moves"])
+        return (
+            f"{row['problem']:<14} exact {row['log_evidence'][-1]:>8.3f}   halving the grid moved it by {moved:.4f}, "
+            f"{row['cells']} cells, {row['seconds']:.0f} s"
+        )
+    said = "  ".join(f"{row[f'tv_{name}']:.3f} ({row[f'limit_{name}']:.3f})" for name in ("yaw", "type", "face"))
+    return (
+        f"{row['problem']:<14} {row['seed']:>5} {row['log_evidence'][-1]:>9.3f} {row['error']:>8.3f} "
+        f"{row['ess']:>6.0f}   {said}"
+    )
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """For every problem what the issue asks for: moves of the grid, Z_hat / Z, and total variations."""
+    told = {}
+    for exact in (row for row in rows if row["what"] == "reference"):
+        seeds = [row for row in rows if row["what"] == "seed" and row["problem"] == exact["problem"]]
+        told[exact["problem"]] = problem_summary(exact, seeds)
+    return told
+
+
+def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
+    """`mean` and its error are of Z_hat / Z of the most objects; tv_* are of the runs' mixture, weighted by Z_hat;
+    `within_*` is the share of runs no farther off than 1.5 times what chance allows at their ESS."""
+    told: Row = {"halving_moves": max(abs(m) for m in exact["halving_moves"]), "neglected": exact["neglected"]}
+    if len(seeds) < 2:
+        return told
+    log_z = [row["log_evidence"][-1] for row in seeds]
+    mean, error = ratio_and_error(log_z, exact["log_evidence"][-1])
+    told |= {
+        "runs": len(seeds),
+        "mean": round(mean, 4),
+        "mean_error": round(error, 4),
+        "errors_off": round((mean - 1) / error, 2) if error > 0 else None,
+        "rms_log": round(float(np.sqrt(np.mean([row["error"] ** 2 for row in seeds]))), 4),
+        "median_ess": round(float(np.median([row["ess"] for row in seeds])), 1),
+    }
+    weight = evidence_weights(log_z)
+    for name in QUANTITIES:
+        mixed = weight @ np.array([row["marginals"][name] for row in seeds])
+        told[f"tv_{name}"] = round(total_variation(mixed, exact["marginals"][name]), 4)
+        told[f"within_{name}"] = round(float(np.mean([row[f"tv_{name}"] <= row[f"limit_{name}"] for row in seeds])), 3)
+    # p(n) of the mean evidence of every number of objects: each is unbiased.
+    stages = np.array([row["log_evidence"] for row in seeds])
+    log_mean = np.logaddexp.reduce(stages, 0) - np.log(len(seeds))
+    mixed = number_of_objects(log_mean, exact["count_ratio"])
+    each = [total_variation(row["num_objects"], exact["num_objects"]) for row in seeds]
+    told["tv_n"] = round(total_variation(mixed, exact["num_objects"]), 4)
+    told["worst_tv_n"] = round(max(each), 4)
+    return told

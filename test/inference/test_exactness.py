@@ -1,0 +1,164 @@
+"""The sampler against exhaustive enumeration, and planted errors that the comparison must catch."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayes3d_ros.evaluation import exact_reference
+from bayes3d_ros.evaluation.agreement import evidence_weights, ratio_and_error, total_variation
+from bayes3d_ros.evaluation.exact_reference import close_to, enumerate_object, true_places, yaw_cells
+from bayes3d_ros.evaluation.experiments import exactness
+from bayes3d_ros.evaluation.experiments.exactness import run, run_marginals
+from bayes3d_ros.evaluation.small_problems import PROBLEMS
+from bayes3d_ros.inference import coarse_to_fine, smc
+from bayes3d_ros.model import likelihood
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Noise, Pixels
+
+SEEDS, PARTICLES = 12, 500
+LEVELS = ((60.0, 0.0), (30.0, 0.0), (30.0, 1e-5), (30.0, 1e-3))  # for an object whose place is known
+
+
+def enumerated(problem):
+    """log Z and the marginals."""
+    found = enumerate_object(problem, levels=LEVELS, where=close_to(*true_places(problem)[0]))
+    return found.log_evidence[-1], found.marginals(problem)
+
+
+def sampled(problem):
+    """log Z_hat of every seed, and the marginals of all, weighted by Z_hat."""
+    runs = [run(problem, seed, PARTICLES) for seed in range(SEEDS)]
+    log_z = [r.log_evidence[-1] for r in runs]
+    each = [run_marginals(problem, r) for r in runs]
+    weight = evidence_weights(log_z)
+    mixed = {name: weight @ np.array([getattr(m, name) for m in each]) for name in ("type", "face", "yaw")}
+    return log_z, mixed, [r.ess for r in runs]
+
+
+def agrees(log_estimates, log_truth):
+    """Whether the mean of Z_hat / Z is 1 within three standard errors, and known well enough to say so. The 0.02 are
+    the enumeration's."""
+    mean, error = ratio_and_error(log_estimates, log_truth)
+    return abs(mean - 1) < 3 * error + 0.02 and error < 0.15
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return PROBLEMS["handle seen"]()
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    return PROBLEMS["handle hidden"]()
+
+
+@pytest.fixture(scope="module")
+def seen_exact(seen):
+    return enumerated(seen)
+
+
+@pytest.fixture(scope="module")
+def hidden_exact(hidden):
+    return enumerated(hidden)
+
+
+def spread(yaw):
+    """Circular standard deviation of a histogram, radians."""
+    middle = (np.arange(len(yaw)) + 0.5) * 2 * np.pi / len(yaw)
+    return np.sqrt(-2 * np.log(np.abs((yaw * np.exp(1j * middle)).sum())))
+
+
+def test_a_handle_in_sight(seen, seen_exact):
+    log_z, mixed, _ = sampled(seen)
+    assert agrees(log_z, seen_exact[0])
+    for name in ("face", "yaw"):
+        assert total_variation(mixed[name], getattr(seen_exact[1], name)) < 0.1
+    result = run(seen, 0, PARTICLES)
+    turn = (result.weight * np.exp(1j * result.contact.yaw[:, 0])).sum()
+    assert np.degrees(np.sqrt(-2 * np.log(np.abs(turn)))) < 5
+    assert np.degrees(np.abs(np.angle(turn * np.exp(-1j * float(seen.truth.yaw[0]))))) < 10
+
+
+def test_a_hidden_handle(hidden, hidden_exact):
+    """The posterior covers the arc that hides the handle."""
+    log_z, mixed, _ = sampled(hidden)
+    log_truth, truth = hidden_exact
+    assert agrees(log_z, log_truth)
+    assert total_variation(mixed["yaw"], truth.yaw) < 0.1
+    arc = truth.yaw > 0.02
+    assert arc.sum() >= 6 and spread(truth.yaw) > np.radians(12)
+    assert spread(mixed["yaw"]) == pytest.approx(spread(truth.yaw), rel=0.2)
+    assert (mixed["yaw"][arc] > truth.yaw[arc] / 3).all()
+
+
+def fresh_step():
+    """`smc.step`, traced anew: code that a test has changed is in it, and no other test's."""
+    return jax.jit(lambda *arguments: smc.step.__wrapped__(*arguments), static_argnums=(5, 6, 7))
+
+
+def test_a_proposal_left_out_of_the_weights_is_caught(monkeypatch, seen, seen_exact):
+    monkeypatch.setattr(smc, "log_density", lambda contact, *_: jnp.zeros(contact.type.shape))
+    monkeypatch.setattr(smc, "step", fresh_step())
+    assert not agrees(sampled(seen)[0], seen_exact[0])
+
+
+def two_turns(count):
+    yaw, width = yaw_cells(count)
+    return np.concatenate([yaw, yaw + 2 * np.pi]), width
+
+
+def test_an_angle_enumerated_twice_is_caught(monkeypatch, seen):
+    monkeypatch.setattr(exact_reference, "yaw_cells", two_turns)
+    assert not agrees(sampled(seen)[0], enumerated(seen)[0])
+
+
+def test_a_bad_score_costs_efficiency_only(monkeypatch, seen, seen_exact):
+    """The coarse level's scores replaced by random ones: fewer effective particles, the same evidence."""
+    good = np.median(sampled(seen)[2])
+
+    def random_scores(*arguments):
+        scores = score_cells(*arguments)
+        noise = jax.random.uniform(jax.random.key(3), scores.shape)
+        return jnp.where(jnp.isfinite(scores), noise, -jnp.inf)
+
+    score_cells = coarse_to_fine.score_cells
+    monkeypatch.setattr(coarse_to_fine, "score_cells", random_scores)
+    monkeypatch.setattr(smc, "step", fresh_step())
+    log_z, _, ess = sampled(seen)
+    mean, error = ratio_and_error(log_z, seen_exact[0])
+    assert abs(mean - 1) < 3 * error + 0.02
+    assert np.median(ess) < good
+
+
+def integral_over_depth(step=1e-4):
+    """Of the likelihood of one pixel over all depths that it may return, given that it does."""
+    z = np.arange(0.1, 2, step)
+    shape = (1, 4, len(z))  # three pixels beside it, without a return
+    depth, kind = np.ones(shape), np.full(shape, NO_RETURN)
+    depth[0, 0], kind[0, 0] = z, IN_WORKSPACE
+    fill = partial(jnp.full, shape)
+    pixels = Pixels(
+        jnp.asarray(depth), jnp.asarray(kind), fill(0.1), fill(-0.2), jnp.float32(0.02), jnp.float32(0.02),
+        jnp.float32(3 / (2**3 - 0.1**3)), jnp.float32(0.01),
+    )  # fmt: skip
+    rendered = jnp.broadcast_to(0.5 + 0.02 * jnp.arange(18.0).reshape(3, 6, 1), (3, 6, len(z)))
+    noise = Noise(jnp.array([0.004]), jnp.array([0.1]))
+    log_p = likelihood.log_likelihood.__wrapped__(rendered, pixels, noise, 3)
+    return float(np.exp(np.asarray(log_p, np.float64)).sum() * step)
+
+
+def test_a_window_counted_wrongly_is_caught(monkeypatch):
+    """Weights of the window's points that sum to nine, not to one: the likelihood is no density of depth any more. The
+    enumeration would not notice, it scores with the same likelihood."""
+    assert integral_over_depth() == pytest.approx(1, abs=1e-3)
+    right = likelihood.inlier_density
+    monkeypatch.setattr(likelihood, "inlier_density", lambda *a: 9 * right(*a))
+    assert integral_over_depth() > 2
+
+
+def test_number_of_objects_follows_from_evidence():
+    """Odds of n + 1 to n are the prior's times Z_{n+1} / Z_n."""
+    p = exactness.number_of_objects([0.0, np.log(20.0), np.log(600.0)], 0.1)
+    np.testing.assert_allclose(p, np.array([1, 2, 6]) / 9)
