@@ -22,6 +22,28 @@ def noise_floor(p: Sequence[float] | np.ndarray, ess: float, quantile: float = 0
     return float(np.quantile(0.5 * np.abs(counts / count - probability).sum(1), quantile))
 
 
+def highest_density(p: Sequence[float] | np.ndarray, share: float) -> Float[np.ndarray, "B"]:
+    """The smallest region of a histogram's bins that holds a share of it: how much of every bin belongs to it: all,
+    none or, of the last, a part. Regions of several pieces, on a circle or a line alike, have a size; intervals about a
+    mean do not describe them."""
+    probability = np.asarray(p, float) / np.sum(p)
+    order = np.argsort(-probability, kind="stable")
+    heights = probability[order]
+    before = np.cumsum(heights) - heights
+    part = np.empty(len(order))
+    part[order] = np.clip((share - before) / np.maximum(heights, 1e-300), 0, 1)
+    return part
+
+
+def region_against(
+    sampled: Sequence[float] | np.ndarray, exact: Sequence[float] | np.ndarray, share: float
+) -> tuple[float, float]:
+    """Of the sampled distribution's region: its width by that of the exact one's, and its exact probability."""
+    region = highest_density(sampled, share)
+    mass = region @ np.asarray(exact, float) / np.sum(exact)
+    return float(region.sum() / highest_density(exact, share).sum()), float(mass)
+
+
 def ratio_and_error(log_estimates: Sequence[float] | np.ndarray, log_truth: float) -> tuple[float, float]:
     """Mean of Z_hat / Z over runs and its standard error."""
     ratio = np.exp(np.asarray(log_estimates, float) - log_truth)
