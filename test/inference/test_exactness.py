@@ -168,11 +168,11 @@ def test_an_angle_enumerated_twice_is_caught(monkeypatch, seen, step):
     assert not agrees(sampled(seen, step())[0], enumerated(seen)[0])
 
 
-def test_a_bad_score_costs_efficiency_only(seen, seen_exact, step):
+def test_a_bad_score_costs_efficiency_only(hidden, hidden_exact, step):
     """The coarse level's scores replaced by random ones: fewer effective particles, the same evidence."""
-    good = sampled(seen, step())[2]
-    log_z, _, ess = sampled(seen, step(Planted(random_scores=True)))
-    mean, error = ratio_and_error(log_z, seen_exact[0])
+    good = sampled(hidden, step())[2]
+    log_z, _, ess = sampled(hidden, step(Planted(random_scores=True)))
+    mean, error = ratio_and_error(log_z, hidden_exact[0])
     assert abs(mean - 1) < 3 * error + 0.02
     assert np.median(ess) < np.median(good)
 
