@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.evaluation import exact_reference
-from bayes3d_ros.evaluation.agreement import evidence_weights, ratio_and_error, region_against, total_variation
+from bayes3d_ros.evaluation.agreement import (
+    evidence_weights,
+    number_of_objects,
+    ratio_and_error,
+    region_against,
+    total_variation,
+)
 from bayes3d_ros.evaluation.exact_pairs import close_to, true_places
 from bayes3d_ros.evaluation.exact_reference import enumerate_object, marginals, yaw_cells
 from bayes3d_ros.evaluation.experiments import exactness
@@ -205,5 +211,5 @@ def test_a_window_counted_wrongly_is_caught(monkeypatch):
 
 def test_number_of_objects_follows_from_evidence():
     """Odds of n + 1 to n are the prior's times Z_{n+1} / Z_n."""
-    p = exactness.number_of_objects([0.0, np.log(20.0), np.log(600.0)], 0.1)
+    p = number_of_objects([0.0, np.log(20.0), np.log(600.0)], 0.1)
     np.testing.assert_allclose(p, np.array([1, 2, 6]) / 9)

@@ -11,7 +11,9 @@ from jaxtyping import Float
 
 from bayes3d_ros.evaluation.agreement import (
     evidence_weights,
+    log_mean,
     noise_floor,
+    number_of_objects,
     ratio_and_error,
     region_against,
     total_variation,
@@ -75,12 +77,6 @@ def run_marginals(problem: Problem, result: Run) -> Marginals:
 def binned(name: str, values: Sequence[float] | np.ndarray) -> Float[np.ndarray, "B"]:
     """A marginal in the bins that distributions are compared in: of yaw, fewer than it is kept in."""
     return np.asarray(values, float).reshape(YAW_BINS, -1).sum(1) if name == "yaw" else np.asarray(values, float)
-
-
-def number_of_objects(log_evidence: Sequence[float] | np.ndarray, count_ratio: float) -> Float[np.ndarray, "n"]:
-    """p(n | image) for a prior that stops at the most objects that log_evidence knows of."""
-    log_p = np.asarray(log_evidence) + np.arange(len(log_evidence)) * np.log(count_ratio)
-    return np.exp(log_p - np.logaddexp.reduce(log_p))
 
 
 def notes(quick: bool) -> list[str]:
@@ -212,10 +208,8 @@ def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
         told[f"tv_{name}"] = round(total_variation(binned(name, mixed[name]), binned(name, true[name])), 4)
         told[f"within_{name}"] = round(float(np.mean([row[f"tv_{name}"] <= row[f"limit_{name}"] for row in seeds])), 3)
     # p(n) of the mean evidence of every number of objects: each is unbiased.
-    stages = np.array([row["log_evidence"] for row in seeds])
-    log_mean = np.logaddexp.reduce(stages, 0) - np.log(len(seeds))
     each = [total_variation(row["num_objects"], exact["num_objects"]) for row in seeds]
-    p_n = number_of_objects(log_mean, exact["count_ratio"])
+    p_n = number_of_objects(log_mean([row["log_evidence"] for row in seeds]), exact["count_ratio"])
     told |= {"tv_n": round(total_variation(p_n, exact["num_objects"]), 4), "worst_tv_n": round(max(each), 4)}
     told |= {"width": {}, "exact_mass": {}}
     for name in PLACES:

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayes3d_ros.evaluation.agreement import evidence_weights, ratio_and_error
+from bayes3d_ros.evaluation.agreement import evidence_weights, log_mean, number_of_objects, ratio_and_error
 from bayes3d_ros.evaluation.experiments import Row
 from bayes3d_ros.evaluation.plots import INK, colour
 from bayes3d_ros.evaluation.small_problems import TABLE_SIZE
@@ -80,22 +80,26 @@ def _marginal(axis: Axes, exact: np.ndarray, runs: np.ndarray, weight: np.ndarra
 
 def _kinds(axis: Axes, exact: Row, seeds: Sequence[Row], weight: np.ndarray) -> None:
     """Types, faces and numbers of objects that are at all likely."""
-    names, true, runs = [], [], []
+    names, true, mixed, runs = [], [], [], []
     for label in ("type", "face", "n"):
         values = exact["num_objects"] if label == "n" else exact["marginals"][label]
         sampled = np.array([row["num_objects"] if label == "n" else row["marginals"][label] for row in seeds])
         sampled = sampled.reshape(len(seeds), len(values))
+        told = weight @ sampled
+        if label == "n" and seeds:  # every number's evidence has a mean of its own
+            told = number_of_objects(log_mean([row["log_evidence"] for row in seeds]), exact["count_ratio"])
         for i, value in enumerate(values):
             if len(values) > 1 and max(value, sampled[:, i].max(initial=0)) > _SHOWN:
                 names.append(f"n = {i}" if label == "n" else f"{label} {i}")
                 true.append(value)
+                mixed.append(told[i])
                 runs.append(sampled[:, i])
     place = np.arange(len(names))
     axis.bar(place, true, width=0.7, color="none", edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)))
     for k, each in enumerate(runs):
         if len(each):
             axis.vlines(k, *np.quantile(each, (0.05, 0.95)), color=GREY, alpha=0.5, linewidth=8)
-            axis.plot(k, weight @ each, "o", color=colour(1), markersize=5)
+            axis.plot(k, mixed[k], "o", color=colour(1), markersize=5)
     axis.set_xticks(place, names)
     axis.set_xlim(-0.8, max(len(names), 3) - 0.2)
     axis.set_ylim(0, 1.05)
