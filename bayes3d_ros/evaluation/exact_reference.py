@@ -43,6 +43,9 @@ BATCH = 128  # objects; one shape, so that there is one compilation
 Where = Callable[[Contact], np.ndarray]  # contacts [N] -> bool [N]
 
 
+_march = jax.jit(renderers["march"])
+
+
 class Cells(NamedTuple):
     """A tiling of the space of one object."""
 
@@ -83,7 +86,7 @@ def with_object(problem: Problem, contact: Contact) -> Scene:
     image, library, table = problem.context
     one = jax.tree.map(lambda a: a[0], single(contact))
     rays = jnp.meshgrid(image.ray_x, image.ray_y)
-    depth = renderers["march"](library, one.type, T_camera_object(one, library, table), tuple(rays))
+    depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
     return _scene(problem, jnp.minimum(image.table, depth))
 
 

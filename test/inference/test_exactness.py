@@ -19,7 +19,7 @@ from bayes3d_ros.evaluation.agreement import (
 from bayes3d_ros.evaluation.exact_pairs import close_to, true_places
 from bayes3d_ros.evaluation.exact_reference import enumerate_object, marginals, yaw_cells
 from bayes3d_ros.evaluation.experiments import exactness
-from bayes3d_ros.evaluation.experiments.exactness import binned, problem_summary, reference_row, run, run_marginals
+from bayes3d_ros.evaluation.experiments.exactness import binned, problem_summary, run, run_marginals
 from bayes3d_ros.evaluation.small_problems import PROBLEMS
 from bayes3d_ros.inference import coarse_to_fine, smc
 from bayes3d_ros.model import likelihood
@@ -66,20 +66,20 @@ def step():
     return with_errors
 
 
-def enumerated(problem):
+def enumerated(problem, levels=LEVELS):
     """log Z and the marginals."""
-    found = enumerate_object(problem, levels=LEVELS, where=close_to(*true_places(problem)[0]))
+    found = enumerate_object(problem, levels=levels, where=close_to(*true_places(problem)[0]))
     return found.log_evidence[-1], found.marginals(problem)
 
 
 def sampled(problem, step):
-    """log Z_hat of every seed, the marginals of all, weighted by Z_hat, and their effective sizes."""
+    """log Z_hat of every seed, and the marginals of all, weighted by Z_hat."""
     runs = [run(problem, seed, PARTICLES, step) for seed in range(SEEDS)]
     log_z = [r.log_evidence[-1] for r in runs]
     each = [run_marginals(problem, r) for r in runs]
     weight = evidence_weights(log_z)
     mixed = {name: weight @ np.array([getattr(m, name) for m in each]) for name in each[0]._fields}
-    return log_z, mixed, [r.ess for r in runs]
+    return log_z, mixed
 
 
 def agrees(log_estimates, log_truth):
@@ -109,14 +109,19 @@ def hidden_exact(hidden):
     return enumerated(hidden)
 
 
+@pytest.fixture(scope="module")
+def seen_sampled(seen, step):
+    return sampled(seen, step())
+
+
 def spread(yaw):
     """Circular standard deviation of a histogram, radians."""
     middle = (np.arange(len(yaw)) + 0.5) * 2 * np.pi / len(yaw)
     return np.sqrt(-2 * np.log(np.abs((yaw * np.exp(1j * middle)).sum())))
 
 
-def test_a_handle_in_sight(seen, seen_exact, step):
-    log_z, mixed, _ = sampled(seen, step())
+def test_a_handle_in_sight(seen, seen_exact, seen_sampled, step):
+    log_z, mixed = seen_sampled
     log_truth, truth = seen_exact
     assert agrees(log_z, log_truth)
     assert total_variation(mixed["face"], truth.face) < 0.1
@@ -132,7 +137,7 @@ def test_a_handle_in_sight(seen, seen_exact, step):
 
 def test_a_hidden_handle(hidden, hidden_exact, step):
     """The posterior covers the arc that hides the handle."""
-    log_z, mixed, _ = sampled(hidden, step())
+    log_z, mixed = sampled(hidden, step())
     log_truth, truth = hidden_exact
     assert agrees(log_z, log_truth)
     yaw, true = binned("yaw", mixed["yaw"]), binned("yaw", truth.yaw)
@@ -143,21 +148,26 @@ def test_a_hidden_handle(hidden, hidden_exact, step):
     assert (yaw[arc] > true[arc] / 3).all()
 
 
-def test_the_prior_as_an_answer_is_caught(seen):
-    """Regions as wide as the prior's, and far from the exact marginals, whatever the evidence."""
-    exact = reference_row(seen, LEVELS)
-    rng = np.random.default_rng(0)
-    free = np.asarray(seen.table_size)[:, None]
-    anywhere = Contact(np.zeros(4000, int), rng.integers(6, size=4000), *((rng.random((2, 4000)) - 0.5) * free),
-                       2 * np.pi * rng.random(4000))  # fmt: skip
-    said = {name: list(p) for name, p in marginals(seen, anywhere, np.ones(4000))._asdict().items()}
-    row = {"log_evidence": exact["log_evidence"], "error": 0.0, "ess": 4000.0, "marginals": said,
-           "num_objects": exact["num_objects"], **{f"{what}_{name}": 0.0 for what in ("tv", "limit")
-           for name in exactness.QUANTITIES}}  # fmt: skip
-    told = problem_summary(exact, [row, row])
-    assert {f"width {name}_{share}" for name in ("x", "y", "yaw") for share in (50, 90)} < set(told["not_met"])
-    assert {"tv_yaw", "tv_face"} < set(told["not_met"])
-    assert min(told["width"].values()) > 5
+def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
+    """Its regions are too wide and its marginals far from the exact ones, whatever the evidence."""
+    rng, count = np.random.default_rng(0), 4000
+    x, y = (rng.random((2, count)) - 0.5) * np.asarray(seen.table_size)[:, None]
+    anywhere = Contact(np.zeros(count, int), rng.integers(6, size=count), x, y, 2 * np.pi * rng.random(count))
+    told = []
+    for said in (seen_exact[1], marginals(seen, anywhere, np.ones(count))):
+        exact = {
+            "log_evidence": [0, seen_exact[0]],
+            "num_objects": [0.5, 0.5],
+            "count_ratio": np.exp(-seen_exact[0]),
+            "marginals": seen_exact[1]._asdict(),
+        }
+        row = exact | {"marginals": said._asdict(), "error": 0.0, "ess": 4000.0}
+        row |= {f"{what}_{name}": 0.0 for what in ("tv", "limit") for name in exactness.QUANTITIES}
+        told.append(problem_summary(exact | {"halving_moves": [0, 0.01], "neglected": 0}, [row, row]))
+    right, prior = told
+    assert right["not_met"] == [] and set(right["width"].values()) == {1.0}
+    assert set(prior["not_met"]) == {"tv_yaw", "tv_face", *(f"width {name}" for name in prior["width"])}
+    assert min(prior["width"].values()) > 5
 
 
 def test_a_proposal_left_out_of_the_weights_is_caught(seen, seen_exact, step):
@@ -169,18 +179,18 @@ def two_turns(count):
     return np.concatenate([yaw, yaw + 2 * np.pi]), width
 
 
-def test_an_angle_enumerated_twice_is_caught(monkeypatch, seen, step):
+def test_an_angle_enumerated_twice_is_caught(monkeypatch, seen, seen_sampled):
+    assert agrees(seen_sampled[0], enumerated(seen, LEVELS[:4])[0])
     monkeypatch.setattr(exact_reference, "yaw_cells", two_turns)
-    assert not agrees(sampled(seen, step())[0], enumerated(seen)[0])
+    assert not agrees(seen_sampled[0], enumerated(seen, LEVELS[:4])[0])
 
 
 def test_a_bad_score_costs_efficiency_only(hidden, hidden_exact, step):
-    """The coarse level's scores replaced by random ones: fewer effective particles, the same evidence."""
-    good = sampled(hidden, step())[2]
-    log_z, _, ess = sampled(hidden, step(Planted(random_scores=True)))
-    mean, error = ratio_and_error(log_z, hidden_exact[0])
-    assert abs(mean - 1) < 3 * error + 0.02
-    assert np.median(ess) < np.median(good)
+    """The coarse level's scores replaced by random ones: another proposal, the same evidence. How much efficiency it
+    costs is the search's affair."""
+    log_z, _ = sampled(hidden, step(Planted(random_scores=True)))
+    assert log_z[0] != run(hidden, 0, PARTICLES, step()).log_evidence[-1]
+    assert agrees(log_z, hidden_exact[0])
 
 
 def integral_over_depth(step=1e-4):

@@ -19,7 +19,7 @@ from bayes3d_ros.evaluation.agreement import (
     total_variation,
 )
 from bayes3d_ros.evaluation.exact_pairs import enumerate_apart
-from bayes3d_ros.evaluation.exact_reference import LEVELS, YAW_BINS, Levels, Marginals, enumerate_object, marginals
+from bayes3d_ros.evaluation.exact_reference import YAW_BINS, Marginals, enumerate_object, marginals
 from bayes3d_ros.evaluation.experiments import Row
 from bayes3d_ros.evaluation.experiments.exactness_plot import plot
 from bayes3d_ros.evaluation.ranks import effective_size
@@ -105,17 +105,17 @@ def steps(quick: bool) -> Iterator[list[Row]]:
             yield [seed_row(problem, exact, seed)]
 
 
-def reference_row(problem: Problem, levels: Levels = LEVELS) -> Row:
+def reference_row(problem: Problem) -> Row:
     """The enumeration of a problem."""
     start = time.perf_counter()
     row: Row = {"what": "reference", "problem": problem.name}
     if len(problem.truth.type) == 1:
-        found = enumerate_object(problem, levels=levels)
+        found = enumerate_object(problem)
         fine, half = [0.0, found.log_evidence[-1]], [0.0, found.log_evidence[-2]]
         said = found.marginals(problem)
         cells, neglected = len(found.cells.log_value), 0.0
     else:
-        both = enumerate_apart(problem, levels)
+        both = enumerate_apart(problem)
         fine, half, said = [0.0, *both.log_evidence], [0.0, *both.log_evidence_half], both.marginals
         cells, neglected = both.cells, both.neglected
     # A prior under which the two largest numbers are equally likely: any error of the last evidence shows in p(n).
