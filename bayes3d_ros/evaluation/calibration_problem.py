@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.evaluation.prior_predictive import DepthRange, draw_depth
+from bayes3d_ros.evaluation.prior_predictive import DepthRange, draw_depth, draw_points
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
@@ -20,11 +20,11 @@ from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Likelihood
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.scene_graph import Contact, Table
-from bayes3d_ros.model.scene_score import Image, add_objects, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import Image, draw_objects, log_likelihood_scene, pad_scene
 
 CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 DISTANCE, TILT = 0.6, np.pi / 4  # of the camera from the table's middle in metres, and of its view below the horizon
@@ -83,6 +83,7 @@ def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
         table=jnp.asarray(bare, jnp.float32),
         outlier_scale=jnp.float32(limits.outlier_scale),
         front_margin=jnp.float32(3 * settings.sigma_max),
+        likelihood=Likelihood(settings.likelihood),
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
@@ -108,10 +109,9 @@ def _render(
     objects: Contact, number: Int[Array, ""], blank: Image, library: LibraryArrays, table: Table, window: int
 ) -> Float[Array, "Hp Wp"]:
     scenes = pad_scene(blank.table, window)[None]
-    any_noise = Noise(jnp.ones(1), jnp.ones(1))
     for m in range(objects.type.shape[0]):
         one = jax.tree.map(lambda a, m=m: a[m][None], objects)
-        drawn = add_objects(one, scenes, blank, library, table, any_noise, window)[1]
+        drawn = draw_objects(one, scenes, blank, library, table, window)
         scenes = jnp.where(m < number, drawn, scenes)
     return scenes[0]
 
@@ -119,8 +119,13 @@ def _render(
 def observe(
     rng: np.random.Generator, surface: Float[np.ndarray, "H W"], noise: tuple[float, float], problem: Problem
 ) -> Image:
-    """An image of rendered depth with noise (sigma, p_outlier), every pixel returned."""
+    """What the likelihood is a density of, given rendered depth and noise (sigma, p_outlier): an image of which every
+    pixel returned, or as many free points; of those the depth image holds one a pixel, for the search to look at."""
     rays = np.asarray(problem.blank.ray_x), np.asarray(problem.blank.ray_y)
+    if problem.settings.likelihood == "points":
+        points = draw_points(rng, surface, *rays, noise, problem.limits)
+        some = points.kind[0] != NO_RETURN
+        return problem.blank._replace(depth=jnp.where(some, points.depth[0], 0.0), kind=points.kind[0], points=points)
     depth = draw_depth(rng, surface, *rays, noise, problem.limits, problem.settings.window)
     return problem.blank._replace(depth=jnp.asarray(depth, jnp.float32))
 

@@ -1,4 +1,4 @@
-"""The model run forwards: scenes and noise from the prior, depth images from the likelihood's own density."""
+"""The model run forwards: scenes and noise from the prior, images or free points from the likelihood's own density."""
 
 from functools import partial
 from typing import NamedTuple
@@ -11,11 +11,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.smc import OVERLAP_LIMIT
 from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Pixels, inlier_density
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Pixels, inlier_density
 from bayes3d_ros.model.scene_graph import Contact, Table, overlap
+from bayes3d_ros.model.scene_score import FreePoints
 
 _BATCH, _TRIALS = 8, 200  # proposals of a scene drawn at a time; how many times
 _DEPTHS, _TAIL = 1024, 7.0  # depths of the sum, from and to so many sigma beyond what the window holds
+
+_LAYERS = 12  # points that a pixel may hold, of one on average
 
 
 class DepthRange(NamedTuple):
@@ -114,6 +117,48 @@ def draw_depth(
     near3, far3 = limits.near**3, limits.far**3
     anywhere = np.cbrt(near3 + rng.random(surface.shape) * (far3 - near3))
     return np.where(empty | (rng.random(surface.shape) < p_outlier), anywhere, np.asarray(seen, np.float64))
+
+
+def draw_points(
+    rng: np.random.Generator,
+    surface: Float[np.ndarray, "H W"],
+    ray_x: Float[np.ndarray, "W"],
+    ray_y: Float[np.ndarray, "H"],
+    noise: tuple[float, float],
+    limits: DepthRange,
+) -> FreePoints:
+    """H W free points of the density that `likelihood.point_density` sums, given the rendered depth, inf where there is
+    no surface; noise is (sigma, p_outlier). Not cut off at windows: what points cost that stray from theirs shows.
+
+    Each is an outlier with p_outlier, or what a ray shows, any ray: a point of the surface with normal errors, or
+    where there is none one of the pixel's part of the frustum. Points that errors carry out of the image are kept in
+    the pixels at its rim.
+    """
+    sigma, p_outlier = noise
+    (height, width), count = surface.shape, surface.size
+    near3, far3 = limits.near**3, limits.far**3
+    step_x, step_y = ray_x[1] - ray_x[0], ray_y[1] - ray_y[0]
+    v, u = np.divmod(rng.integers(count, size=count), width)  # outliers are of any pixel, too
+    inlier = (rng.random(count) >= p_outlier) & np.isfinite(surface[v, u])
+    z = np.where(inlier, surface[v, u], np.cbrt(near3 + rng.random(count) * (far3 - near3)))
+    within = np.where(inlier, 0.0, rng.uniform(-0.5, 0.5, (2, count)))
+    error = np.where(inlier, sigma * rng.standard_normal((3, count)), 0.0)
+    x, y, z = z * (ray_x[u] + within[0] * step_x), z * (ray_y[v] + within[1] * step_y), z
+    x, y, z = x + error[0], y + error[1], z + error[2]
+    u = np.clip(np.rint((x / z - ray_x[0]) / step_x), 0, width - 1).astype(int)
+    v = np.clip(np.rint((y / z - ray_y[0]) / step_y), 0, height - 1).astype(int)
+    # The how-manieth of its pixel a point is.
+    pixel = v * width + u
+    order = np.argsort(pixel, kind="stable")
+    layer = np.empty(count, int)
+    layer[order] = np.arange(count) - np.searchsorted(pixel[order], pixel[order])
+    if layer.max() >= _LAYERS:
+        raise ValueError(f"a pixel holds {layer.max() + 1} points, expected at most {_LAYERS}")
+    depth, beside_x, beside_y = np.ones((3, _LAYERS, height, width), np.float32)
+    kind = np.full(depth.shape, NO_RETURN, np.int32)
+    at = layer, v, u
+    depth[at], beside_x[at], beside_y[at], kind[at] = z, x / z - ray_x[u], y / z - ray_y[v], IN_WORKSPACE
+    return FreePoints(*(jnp.asarray(a) for a in (depth, kind, beside_x, beside_y)))
 
 
 @partial(jax.jit, static_argnames="window")

@@ -8,8 +8,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.alignment import align
-from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, wrap
-from bayes3d_ros.inference.mode_search import Hypotheses, adapt, as_mixture, best_first, narrow, sharpen, take
+from bayes3d_ros.inference.annealing import LEVELS, exponents
+from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, log_density, wrap
+from bayes3d_ros.inference.mode_search import (
+    PILOT_DRAWS,
+    Hypotheses,
+    Pilots,
+    adapt,
+    as_mixture,
+    best_first,
+    narrow,
+    sharpen,
+    take,
+    with_half_turns,
+)
 from bayes3d_ros.inference.noise import NoiseGrid, log_marginal, peak
 from bayes3d_ros.inference.sketch_search import (
     YAWS,
@@ -51,11 +63,14 @@ class Context(NamedTuple):
 
 
 def evidence_left(scene_depth: Float[Array, "H W"], image: Image, noise: Noise) -> Evidence:
-    """Returns in the workspace that stand in front of the scene by more than noise are unexplained. Everything else is
-    kept as a witness of free space."""
+    """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
+    explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
+    an outlier whatever is added, and no witness."""
     in_front = scene_depth - image.depth
-    unexplained = jnp.clip((in_front / (3 * noise.sigma[0] + 0.003 * image.depth) - 1), 0.0, 1.0)
-    return Evidence(image.depth, jnp.where(image.kind == IN_WORKSPACE, unexplained, 0.0))
+    apart = in_front / (3 * noise.sigma[0] + 0.003 * image.depth)
+    unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)
+    inside = image.kind == IN_WORKSPACE
+    return Evidence(image.depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
 
 
 def conflicts(contact: Contact, others: Contact, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
@@ -107,7 +122,7 @@ def candidates(
     contact, information = align(contact, evidence, image, library, table)
     loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
     found = Hypotheses(contact, jnp.linalg.inv(information / _ALIGNED**2 + loose))
-    score = sketch_score(contact, evidence, image, library, table, 0.01, 0.5, SKETCH_POINTS)
+    score = sketch_score(contact, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(contact, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(contact, others, scene.num_objects, library, overlap_limit)
@@ -132,8 +147,9 @@ def find_proposal(
     table_size: tuple[float, float],
     window: int,
     overlap_limit: float,
-) -> Proposal:
-    """The proposal for one more object, given the scene that stands for the population."""
+) -> tuple[Proposal, Float[Array, "L"]]:
+    """The proposal for one more object, given the scene that stands for the population, and the exponents by which to
+    go from it to the target."""
     image, library, table = context
     noise = peak(scene.table, grid)
     height, width = image.depth.shape
@@ -159,10 +175,11 @@ def find_proposal(
     found, gain = best_first(found, _distinct(found.contact, gain, (0.004, 0.05)), _MODES)
     worth = gain[0] > _WORTH
 
-    def search() -> Modes:
+    def search() -> tuple[Modes, Pilots]:
         narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
         modes, value = narrow(narrow_key, found, rough)
-        modes, _ = best_first(modes, value, _FINALISTS)
+        modes, value = best_first(modes, value, _MODES)
+        modes, _ = best_first(modes, _distinct(modes.contact, value, (0.006, 0.15)), _FINALISTS)
         noise = noise_with(modes.contact)
 
         def exact(contact: Contact) -> Float[Array, "N"]:
@@ -176,12 +193,19 @@ def find_proposal(
             return log_marginal(scene.table + gain, grid)
 
         modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
-        return adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
+        mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
+        return with_half_turns(mixture, exact), pilots
 
-    def nothing() -> Modes:
-        return as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))
+    def nothing() -> tuple[Modes, Pilots]:
+        modes = as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))
+        mixture = with_half_turns(modes, lambda contact: jnp.zeros(contact.type.shape))
+        nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.contact)
+        return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))
 
-    mixture = jax.lax.cond(worth, search, nothing)
+    mixture, pilots = jax.lax.cond(worth, search, nothing)
     cells = hidden_cells(image, table, shape)
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
-    return Proposal(mixture, cells / cells.sum(), shares)
+    proposal = Proposal(mixture, cells / cells.sum(), shares)
+    log_q = log_density(pilots.contact, proposal, library, table)
+    path = exponents(pilots.log_target - log_q, log_q - pilots.log_drawn)
+    return proposal, jnp.where(worth, path, jnp.ones(LEVELS))

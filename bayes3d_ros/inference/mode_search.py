@@ -14,8 +14,10 @@ from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
 
 Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
-_PILOT_ROUNDS, _PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
+_PILOT_ROUNDS, PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
 _INFLATION, _FLATTEN = 1.5, 4.0
+_TRUST = 0.5  # in the pilots' word on a mode's mass: they are few
+_EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find
 _PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
 
@@ -25,6 +27,14 @@ class Hypotheses(NamedTuple):
 
     contact: Contact  # [N]
     covariance: Float[Array, "N 3 3"]
+
+
+class Pilots(NamedTuple):
+    """Draws that a mixture was fitted to, once they told what they could."""
+
+    contact: Contact  # [D]
+    log_target: Float[Array, "D"]  # up to a constant
+    log_drawn: Float[Array, "D"]  # log density of what drew them
 
 
 def take(tree: Tree, index: Array | slice) -> Tree:
@@ -137,27 +147,49 @@ def sharpen(
 
 def adapt(
     key: PRNGKeyArray, modes: Modes, gains: Callable, library: LibraryArrays, table: Table
-) -> Modes:
+) -> tuple[Modes, Pilots]:
     """Refit the mixture to weighted draws from itself until their weights are even enough. The draws are thrown away:
     the sampler's own come after, so that nothing is chosen by its weight."""
 
+    def pilot(key: PRNGKeyArray, modes: Modes) -> tuple[Modes, Pilots, Array]:
+        wide = modes._replace(scale=_PILOT_SCALE * modes.scale)
+        draws = draw_modes(key, wide, PILOT_DRAWS)
+        log_target = gains(draws) + log_prior(draws, library, table)
+        log_drawn = jax.nn.logsumexp(log_density_modes(draws, wide), 1)
+        log_weight = log_target - log_drawn
+        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
+        weight = _temper(log_weight[None], _PILOT_ESS * PILOT_DRAWS)[0]
+        # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
+        component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)
+        mass = jax.nn.logsumexp(component + log_weight[:, None], 0)
+        share = jnp.logaddexp(jax.nn.log_softmax(_TRUST * mass), jnp.log(0.03 / len(mass)))
+        fitted = refit(draws, weight, modes)._replace(log_weight=jax.nn.log_softmax(share))
+        return fitted, Pilots(draws, log_target, log_drawn), effective_fraction(log_weight)
+
     def unfit(state: tuple) -> Array:
-        trial, ess, _, _ = state
+        trial, _, _, ess = state
         return (trial < _PILOT_ROUNDS) & (ess < _PILOT_ESS)
 
-    def pilot(state: tuple) -> tuple:
-        trial, _, modes, key = state
-        key, draw_key = jax.random.split(key)
-        wide = modes._replace(scale=_PILOT_SCALE * modes.scale)
-        draws = draw_modes(draw_key, wide, _PILOT_DRAWS)
-        log_weight = gains(draws) + log_prior(draws, library, table)
-        log_weight -= jax.nn.logsumexp(log_density_modes(draws, wide), 1)
-        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
-        ess = effective_fraction(log_weight)
-        weight = _temper(log_weight[None], _PILOT_ESS * _PILOT_DRAWS)[0]
-        return trial + 1, ess, refit(draws, weight, modes), key
+    def again(state: tuple) -> tuple:
+        trial, modes, _, _ = state
+        return trial + 1, *pilot(jax.random.fold_in(key, trial), modes)
 
-    return jax.lax.while_loop(unfit, pilot, (0, jnp.float32(0.0), modes, key))[2]
+    _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (1, *pilot(jax.random.fold_in(key, 0), modes)))
+    return modes, pilots
+
+
+def with_half_turns(modes: Modes, gains: Callable) -> Modes:
+    """Each component, and it turned by 180 degrees about each axis of its box, the four sharing its weight by their log
+    likelihoods: most things look alike that way, or nearly, and a search that found one of them need not find all."""
+    turned = [
+        modes.centre._replace(face=modes.centre.face ^ over, yaw=modes.centre.yaw + about)
+        for over in (0, 1)
+        for about in (0.0, jnp.pi)
+    ]
+    centre = jax.tree.map(lambda *a: jnp.concatenate(a), *turned)
+    value = jnp.maximum(gains(centre), -1e9).reshape(4, -1)
+    share = jnp.logaddexp(jax.nn.log_softmax(value / 2, 0) + jnp.log(0.96), jnp.log(0.01))
+    return Modes(centre, jnp.tile(modes.scale, (4, 1, 1)), (modes.log_weight + share).ravel())
 
 
 def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
@@ -166,4 +198,4 @@ def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
     scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
-    return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(0.05 / len(value)))))
+    return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))

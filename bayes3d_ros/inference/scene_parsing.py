@@ -18,7 +18,7 @@ from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_t
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
 from bayes3d_ros.model.library_arrays import library_arrays
-from bayes3d_ros.model.likelihood import BEYOND
+from bayes3d_ros.model.likelihood import BEYOND, Likelihood
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
@@ -137,6 +137,7 @@ class SceneParser:
             table=jnp.asarray(bare, jnp.float32),
             outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
             front_margin=jnp.float32(3 * settings.sigma_max),
+            likelihood=Likelihood(settings.likelihood),
         )
         table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
         return image, table, T_camera_table, notes

@@ -48,6 +48,11 @@ class ParserSettings:
     score_width: int = setting(
         160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280
     )
+    likelihood: str = setting(
+        "depth",
+        "what a return is scored as: the depth of its pixel, or the paper's free 3D point (too sure of the noise)",
+        choices=("depth", "points"),
+    )
     window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
     sigma_max: float = setting(
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1

@@ -21,7 +21,7 @@ YAWS = 24
 MAX_CELLS = 512
 _BLOCK = 4  # cells a step
 # Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
-_COARSE = (0.02, 0.25, 36)  # tolerance, penalty, points
+_COARSE = (0.02, 0.5, 36)  # tolerance, penalty, points
 _REACH = 3  # cells: how far from unexplained returns an object's centre is looked for
 _NATS = 8.0  # what a pixel explained is worth, roughly
 
@@ -31,6 +31,7 @@ class Evidence(NamedTuple):
 
     depth: Float[Array, "H W"]
     unexplained: Float[Array, "H W"]
+    explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
 
 
 def sketch_score(
@@ -46,12 +47,11 @@ def sketch_score(
     """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
     past, relative to the reward of one that matches; the first `points` of the sketch are used."""
     T = T_camera_object(contact, library, table)
-    z, gap, weight = _compare(T, contact.type, evidence, image, library, points)
+    z, gap, weight, against, facing = _compare(T, contact.type, evidence, image, library, points)
     matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * weight
-    through = jnp.where(gap > tolerance, jnp.minimum(gap / tolerance - 1, 1.0), 0.0)
-    # Half of the surface faces the camera; its pixels, at half obliqueness.
+    through = jnp.where(gap > tolerance, jnp.minimum(gap / tolerance - 1, 1.0), 0.0) * against
     pixels = library.sketch_area[contact.type] * library.sketch.shape[1] / points * image.focal[0] * image.focal[1]
-    return _NATS * 0.5 * pixels * ((matched - penalty * through) / z**2).sum(-1)
+    return _NATS * pixels * ((matched - penalty * through) * facing / z**2).sum(-1)
 
 
 def _compare(T, type_index, evidence, image, library, points):
@@ -64,6 +64,9 @@ def _compare(T, type_index, evidence, image, library, points):
         sum(rotation[:, a, b][:, None] * sketch[..., b] for b in range(3)) + translation[:, a][:, None]
         for a in range(3)
     )
+    normal = library.sketch_normal[type_index, :points]
+    nx, ny, nz = (sum(rotation[:, a, b][:, None] * normal[..., b] for b in range(3)) for a in range(3))
+    facing = jnp.maximum(-(nx * x + ny * y + nz * z), 0.0) / jnp.sqrt(x * x + y * y + z * z)
     z = jnp.maximum(z, 0.02)
     u = jnp.round(x / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
     v = jnp.round(y / z * image.focal[1] + image.centre[1]).astype(jnp.int32)
@@ -72,7 +75,8 @@ def _compare(T, type_index, evidence, image, library, points):
     observed = evidence.depth.ravel()[index]
     weight = evidence.unexplained.ravel()[index]
     known = seen & (observed > 0)
-    return z, jnp.where(known, observed - z, 0.0), jnp.where(known, weight, 0.0)
+    against = evidence.explained.ravel()[index]
+    return z, jnp.where(known, observed - z, 0.0), jnp.where(known, weight, 0.0), against, facing
 
 
 def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:

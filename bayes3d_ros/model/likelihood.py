@@ -1,15 +1,28 @@
-"""The likelihood of a depth image, given which pixels returned (the mask is taken as given).
+"""Likelihoods of what a depth camera returned, given which pixels did (the mask is taken as given).
 
-For a return z at a pixel with ray r (r_z = 1), and rendered points y_j r_j in the pixel's window at distance d_j from
-its ray,
+`likelihoods` is the one table. Each row gives the density of inliers, and every pixel then has
+p_out a(z) + (1 - p_out) inlier, with a(z) = 3 z^2 / (far^3 - near^3), the density of depth uniform in the frustum.
 
-    p_out a(z) + (1 - p_out) sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),  w_j ~ exp(-d_j^2 / 2 sigma^2) + c,
+`depth`, the default, is a density of the depth image. For a return z at a pixel with ray r (r_z = 1), and rendered
+points y_j r_j in the pixel's window at distance d_j from its ray,
 
-with the w_j normalised over the window's surface points and a(z) = 3 z^2 / (far^3 - near^3), the density of depth
-uniform in the frustum's volume. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's ray, so that it is a density
-of the depth image and integrates to one over z for every scene. Where the window holds no surface, the density is a(z).
+    inlier(z) = sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),  w_j ~ exp(-d_j^2 / 2 sigma^2) + c,
+
+with the w_j normalised over the window's surface points. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's
+ray, so that it integrates to one over z for every scene. Where the window holds no surface, the density is a(z).
 The constant c (LATERAL) stands for lateral errors, pixels that see what their neighbours look at. Without it every
 pixel that an edge crosses costs up to a dozen nats at once, and the posterior is a heap of splinters.
+
+`points` is Bayes3D's own form: W H free points, each an outlier uniform in the frustum's volume
+V = (far^3 - near^3) W H / (3 fx fy), or what one of the W H rays, any of them, shows, with normal errors in all three
+coordinates. A ray that meets no surface shows a point uniform in its own pixel's part of the frustum. So
+
+    p(x) = p_out / V + (1 - p_out) (sum_j N3(x; y_j, sigma^2 I) + b(x) W H / V) / (W H),
+
+b(x) being 1 in pixels whose ray meets nothing. Dividing by W H, which the image fixes, and not by the number of surface
+points keeps p a density for every scene, and what a pixel adds a matter of its window. The sum is cut off at the
+window of the pixel that x lies in: where 3 sigma f / z goes beyond half of it, mass is missing. Given is
+p(x) W H z^2 / (fx fy), the same density over (u, v, z), u and v in pixels, times W H: its outliers are a(z) again.
 
 A return beyond the workspace (floor, wall, robot) is free-space evidence: where the scene puts a surface in front of
 it, it is an outlier, p_out a(z); elsewhere it has the scene-independent density a(z).
@@ -17,6 +30,8 @@ it, it is an outlier, p_out a(z); elsewhere it has the scene-independent density
 Arrays are [rows, columns, tiles]: tiles come last, so that every operation runs along them.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -37,6 +52,14 @@ class Noise(NamedTuple):
     p_outlier: Float[Array, "P"]
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Likelihood:
+    """A row of `likelihoods`. What is scored carries it: to jit it is a part of the type, like a static argument."""
+
+    name: str = "depth"
+
+
 class Pixels(NamedTuple):
     """Observed pixels with their geometry: rays (x, y, 1), and the ray's change per pixel."""
 
@@ -48,6 +71,9 @@ class Pixels(NamedTuple):
     step_y: Float[Array, ""]
     outlier_scale: Float[Array, ""]  # 3 / (far^3 - near^3)
     front_margin: Float[Array, ""]  # metres; a surface less than this behind a return still counts as in front
+    likelihood: Likelihood = Likelihood()
+    # Of free points: x / z and y / z less those of the pixel's ray. A depth image has its points on the rays.
+    beside: tuple[Float[Array, "h w T"], Float[Array, "h w T"]] | None = None
 
 
 def inlier_density(
@@ -83,8 +109,40 @@ def inlier_density(
     return jnp.where(nearest < _FAR_AWAY, jnp.stack(density), outlier_density(pixels))
 
 
+def point_density(
+    rendered: Float[Array, "hr wr T"], pixels: Pixels, sigma: Float[Array, "S"], window: int
+) -> Float[Array, "S h w T"]:
+    """The sum over the window of free points' density, per pixel and metre; `rendered` as in `inlier_density`."""
+    half = window // 2
+    height, width = pixels.depth.shape[:2]
+    a, b, z = pixels.ray_x, pixels.ray_y, pixels.depth
+    norm2 = 1 + a * a + b * b
+    beside_x, beside_y = pixels.beside or (0.0, 0.0)
+    apart2 = []  # squared distances from every point in the window
+    for dv in range(-half, half + 1):
+        for du in range(-half, half + 1):
+            y = rendered[half + dv : half + dv + height, half + du : half + du + width]
+            surface = jnp.isfinite(y)
+            y = jnp.where(surface, y, 0.0)
+            # z r - y r_j = (z - y) r + (cx, cy, 0): exact where the two rays are nearly one.
+            e = z - y
+            cx, cy = z * beside_x - y * du * pixels.step_x, z * beside_y - y * dv * pixels.step_y
+            apart2.append(jnp.where(surface, e * (e * norm2 + 2 * (a * cx + b * cy)) + cx * cx + cy * cy, _FAR_AWAY))
+    per_pixel = z * z * pixels.step_x * pixels.step_y / (2 * jnp.pi) ** 1.5
+    nothing = ~jnp.isfinite(rendered[half : half + height, half : half + width])
+    background = jnp.where(nothing, outlier_density(pixels), 0.0)
+    density = []
+    for s in range(sigma.shape[0]):
+        total = sum(jnp.exp(-0.5 / sigma[s] ** 2 * d) for d in apart2)
+        density.append(per_pixel / sigma[s] ** 3 * total + background)
+    return jnp.stack(density)
+
+
 def outlier_density(pixels: Pixels) -> Float[Array, "h w T"]:
     return pixels.outlier_scale * pixels.depth**2
+
+
+likelihoods: dict[str, Callable] = {"depth": inlier_density, "points": point_density}
 
 
 @partial(jax.jit, static_argnames="window")
@@ -92,33 +150,39 @@ def log_likelihood(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
 ) -> Float[Array, "S P T"]:
     """Sum over the pixels of each tile of the log likelihood, for every pair of noise values. Their number is a
-    multiple of four; `rendered` has a border of window // 2 pixels around."""
+    multiple of four; `rendered` has a border of window // 2 pixels around. Of free points a pixel may hold several:
+    then `pixels` has L times the tiles of `rendered`, all tiles of one layer after those of the other."""
+    layers = pixels.depth.shape[-1] // rendered.shape[-1]
+    rendered = jnp.concatenate([rendered] * layers, -1) if layers > 1 else rendered
     half = window // 2
     height, width = pixels.depth.shape[:2]
     a = outlier_density(pixels)
     # Whatever the pixel's kind, its likelihood is p_out outlier + (1 - p_out) inlier.
     in_front = rendered[half : half + height, half : half + width] < pixels.depth + pixels.front_margin
     beyond = jnp.where(in_front, 0.0, a)
-    inlier = inlier_density(rendered, pixels, noise.sigma, window)
+    inlier = likelihoods[pixels.likelihood.name](rendered, pixels, noise.sigma, window)
     inlier = jnp.where(pixels.kind == IN_WORKSPACE, inlier, jnp.where(pixels.kind == BEYOND, beyond, 1.0))
     outlier = jnp.where(pixels.kind == NO_RETURN, 1.0, a)
     tiles = outlier.shape[-1]
-    return _sum_log(outlier.reshape(-1, tiles), inlier.reshape(inlier.shape[0], -1, tiles), noise.p_outlier)
+    at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
+    inlier = inlier.reshape(inlier.shape[0], -1, tiles)
+    total = _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
+    return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
 
 
 def _sum_log(
-    outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"]
+    outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"], at_once: int
 ) -> Float[Array, "S P T"]:
-    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of four pixels. Scaled, so that products
-    stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre."""
+    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of so many pixels. Scaled, so that products
+    stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre (four) or .. 1e15 (two)."""
     outlier, inlier = _SCALE * outlier, _SCALE * inlier
     p = p[None, :, None]
 
-    def four(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
+    def product_of(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
         product: Array | float = 1.0
-        for m in range(4):
-            product *= p * outlier[4 * k + m] + (1 - p) * inlier[:, None, 4 * k + m]
-        return total + (jnp.log(product) - 4 * jnp.log(_SCALE))
+        for m in range(at_once):
+            product *= p * outlier[at_once * k + m] + (1 - p) * inlier[:, None, at_once * k + m]
+        return total + (jnp.log(product) - at_once * jnp.log(_SCALE))
 
     start = jnp.zeros((inlier.shape[0], p.shape[1], outlier.shape[1]))
-    return jax.lax.fori_loop(0, outlier.shape[0] // 4, four, start)
+    return jax.lax.fori_loop(0, outlier.shape[0] // at_once, product_of, start)

@@ -12,12 +12,21 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.likelihood import NO_RETURN, Noise, Pixels, log_likelihood
+from bayes3d_ros.model.likelihood import NO_RETURN, Likelihood, Noise, Pixels, log_likelihood
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
 
 TILE = 8
 CHUNK = 128
+
+
+class FreePoints(NamedTuple):
+    """Free 3D points by the pixels that they fall into, in L layers of at most one a pixel."""
+
+    depth: Float[Array, "L H W"]  # their z
+    kind: Int[Array, "L H W"]
+    beside_x: Float[Array, "L H W"]  # x / z less that of the pixel's ray
+    beside_y: Float[Array, "L H W"]
 
 
 class Image(NamedTuple):
@@ -32,6 +41,8 @@ class Image(NamedTuple):
     table: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
     outlier_scale: Float[Array, ""]
     front_margin: Float[Array, ""]
+    likelihood: Likelihood = Likelihood()
+    points: FreePoints | None = None  # scored in place of the depth image, of which the search still makes use
 
 
 def border(window: int) -> tuple[int, int]:
@@ -128,14 +139,13 @@ def _crop(scenes, index, u, v, side):
     return scenes[index, (v + step)[:, None], u + step]
 
 
-def _observed(image: Image, u, v) -> Pixels:
+def _observed(image: Image, u, v, shape=(TILE, TILE)) -> Pixels:
     """The observed pixels of tiles; those that stick out of the image have no return."""
     height, width = image.depth.shape
-    step = jnp.arange(TILE)[:, None]
-    rows, columns = (v + step)[:, None], u + step
+    rows, columns = (v + jnp.arange(shape[0])[:, None])[:, None], u + jnp.arange(shape[1])[:, None]
     inside = (rows < height) & (columns < width)
     rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
-    return Pixels(
+    pixels = Pixels(
         depth=image.depth[rows, columns],
         kind=jnp.where(inside, image.kind[rows, columns], NO_RETURN),
         ray_x=jnp.broadcast_to(image.ray_x[columns], inside.shape),
@@ -144,6 +154,25 @@ def _observed(image: Image, u, v) -> Pixels:
         step_y=1 / image.focal[1],
         outlier_scale=image.outlier_scale,
         front_margin=image.front_margin,
+        likelihood=image.likelihood,
+    )
+    return pixels if image.points is None else _observed_points(image.points, pixels, rows, columns, inside)
+
+
+def _observed_points(points: FreePoints, pixels: Pixels, rows, columns, inside) -> Pixels:
+    """Free points in place of the depth of these pixels, layer after layer."""
+    count = points.depth.shape[0]
+
+    def in_every_layer(a: Array) -> Array:
+        return jnp.concatenate([a] * count, -1)
+
+    depth, kind, x, y = (jnp.concatenate(list(a[:, rows, columns]), -1) for a in points)
+    return pixels._replace(
+        depth=depth,
+        kind=jnp.where(in_every_layer(inside), kind, NO_RETURN),
+        ray_x=in_every_layer(pixels.ray_x),
+        ray_y=in_every_layer(pixels.ray_y),
+        beside=(x, y),
     )
 
 
@@ -175,40 +204,26 @@ def log_likelihood_gain(
     return _over_tiles(add, gains, contact, image, library, table, half)
 
 
-def add_objects(
+def draw_objects(
     contact: Contact,
     scenes: Float[Array, "N Hp Wp"],
     image: Image,
     library: LibraryArrays,
     table: Table,
-    noise: Noise,
     window: int,
-) -> tuple[Float[Array, "N S P"], Float[Array, "N Hp Wp"], Int[Array, "N"]]:
-    """Scene n with object n rendered into it: the gain as in `log_likelihood_gain`, the new depth, and the number of
-    pixels that the object would cover alone in the image."""
+) -> Float[Array, "N Hp Wp"]:
+    """Scene n with object n rendered into it."""
     half = window // 2
-    side = TILE + 2 * half
     height, width = image.depth.shape
 
-    def draw(state, n, u, v, depth, real):
-        gains, drawn, covered = state
-        pixels = _observed(image, u, v)
-        before = _crop(scenes, n, u, v, side)
-        gain = log_likelihood(jnp.minimum(before, depth), pixels, noise, window)
-        gain -= log_likelihood(before, pixels, noise, window)
+    def draw(drawn, n, u, v, depth, real):
         step = jnp.arange(TILE)[:, None]
         rows, columns = (v + step)[:, None], u + step
         inside = real & (rows < height) & (columns < width)
         depth = jnp.where(inside, depth[half : half + TILE, half : half + TILE], jnp.inf)
-        return (
-            gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1)),
-            drawn.at[n, half + rows, half + columns].min(depth),
-            covered.at[n].add(jnp.isfinite(depth).sum((0, 1))),
-        )
+        return drawn.at[n, half + rows, half + columns].min(depth)
 
-    gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    start = (gains, scenes, jnp.zeros(contact.type.shape, jnp.int32))
-    return _over_tiles(draw, start, contact, image, library, table, half)
+    return _over_tiles(draw, scenes, contact, image, library, table, half)
 
 
 def halved(image: Image) -> Image:
@@ -221,6 +236,7 @@ def halved(image: Image) -> Image:
         focal=image.focal / 2,
         centre=image.centre / 2,
         table=image.table[::2, ::2],
+        points=None,  # good enough for a search
     )
 
 
@@ -230,22 +246,12 @@ def log_likelihood_scene(
     """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
     height, width = image.depth.shape
     half = window // 2
-    grow = -width % 4  # pixels without a return, to a multiple of four
-    shape = (height, width + grow, 1)
-    pad = [(0, 0), (0, grow)]
-    pixels = Pixels(
-        depth=jnp.pad(image.depth, pad)[..., None],
-        kind=jnp.pad(image.kind, pad, constant_values=NO_RETURN)[..., None],
-        ray_x=jnp.broadcast_to(jnp.pad(image.ray_x, pad[1])[:, None], shape),
-        ray_y=jnp.broadcast_to(image.ray_y[:, None, None], shape),
-        step_x=1 / image.focal[0],
-        step_y=1 / image.focal[1],
-        outlier_scale=image.outlier_scale,
-        front_margin=image.front_margin,
-    )
+    # One tile, grown by pixels without a return to a multiple of four of them.
+    tall, wide = height, width + -width % 4
+    pixels = _observed(image, jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32), (tall, wide))
 
     def one(scene: Float[Array, "Hp Wp"]) -> Float[Array, "S P"]:
-        rendered = scene[: height + 2 * half, : width + grow + 2 * half, None]
+        rendered = scene[: tall + 2 * half, : wide + 2 * half, None]
         return log_likelihood(rendered, pixels, noise, window)[..., 0]
 
     return jax.lax.map(one, scenes)

@@ -9,7 +9,7 @@ import pytest
 
 from bayes3d_ros.evaluation import calibration_problem
 from bayes3d_ros.evaluation.calibration_problem import SETTINGS, Samples, log_likelihood, observe, render, small_problem
-from bayes3d_ros.evaluation.experiments import calibration
+from bayes3d_ros.evaluation.experiments import calibration, calibration_points
 from bayes3d_ros.evaluation.prior_predictive import draw_noise, draw_scene
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
@@ -55,11 +55,15 @@ def test_rows_are_json_and_of_their_scene_alone(problem, rows):
         assert calibration.line(row).count("\n") == 0
 
 
-def test_the_truth_is_scored_as_the_sampler_scores_it(problem):
+@pytest.mark.parametrize("likelihood", ["depth", "points"])
+def test_the_truth_is_scored_as_the_sampler_scores_it(problem, likelihood):
     """The likelihood of a scene drawn whole is that which the sampler sums object by object."""
+    if likelihood == "points":
+        problem = small_problem(calibration_points.POINTS)
     objects, _ = draw_scene(jax.random.key(0), np.array([-np.inf, 0.0]), problem.library, problem.table)
     surface = render(objects, 1, problem)
     image = observe(np.random.default_rng(0), surface, (0.002, 0.1), problem)
+    assert (image.points is not None) == (likelihood == "points")
     settings = problem.settings
     context = Context(image, problem.library, problem.table)
     empty = smc.init(context, problem.grid, settings.particles, settings.max_objects, settings.window)
@@ -132,5 +136,6 @@ def test_scenes_without_objects_are_a_summary_and_a_picture(tmp_path):
 
 def test_quick_is_a_part_of_the_whole():
     assert calibration.count(True) < calibration.count(False) == 1000
+    assert calibration_points.count(True) < calibration_points.count(False)
     assert calibration.notes(True) == []
     assert calibration_problem.SETTINGS.max_objects == 2

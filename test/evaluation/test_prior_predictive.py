@@ -1,5 +1,7 @@
 """The model run forwards agrees with the densities that score it."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,20 @@ import pytest
 from scipy.stats import kstest
 
 from bayes3d_ros.evaluation.calibration_problem import small_problem
-from bayes3d_ros.evaluation.prior_predictive import DepthRange, _proposals, draw_depth, draw_noise, draw_scene
+from bayes3d_ros.evaluation.prior_predictive import (
+    DepthRange,
+    _proposals,
+    draw_depth,
+    draw_noise,
+    draw_points,
+    draw_scene,
+)
+from bayes3d_ros.evaluation.ranks import rank
+from bayes3d_ros.inference.noise import NoiseGrid, noise_grid, sample
 from bayes3d_ros.inference.smc import OVERLAP_LIMIT
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Pixels, inlier_density, outlier_density
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Likelihood, Pixels, inlier_density, outlier_density
 from bayes3d_ros.model.scene_graph import log_prior, overlap
+from bayes3d_ros.model.scene_score import Image, log_likelihood_scene, pad_scene
 
 LIMITS, WINDOW, FOCAL = DepthRange(0.2, 1.0), 3, 60.0
 HEIGHT, WIDTH = 4, 6
@@ -126,3 +138,70 @@ def test_noise_is_of_the_prior_that_is_integrated(problem):
         assert np.isin(drawn, np.asarray(grid, float)).all()
         assert drawn.mean() == pytest.approx((low + high) / 2, abs=4 * (high - low) / np.sqrt(12 * 1500))
         assert kstest((drawn - low) / (high - low), "uniform").statistic < 0.06  # a fine grid
+
+
+class Cloud(NamedTuple):
+    """A scene with holes, and how free points of it are scored."""
+
+    image: Image
+    surface: np.ndarray
+    grid: NoiseGrid
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    """A slanted plane, a thing in front of it, a third without any surface; 3 sigma f / z stays in half the window."""
+    height, width, focal = 18, 24, 60.0
+    v, u = np.mgrid[:height, :width]
+    depth = 0.6 + 0.004 * v - 0.003 * u
+    depth[6:12, 8:14] -= 0.06
+    depth[:, 16:] = np.inf
+    x, y = (np.arange(width) - 11.5) / focal, (np.arange(height) - 8.5) / focal
+    blank = Image(
+        depth=jnp.zeros(depth.shape),
+        kind=jnp.full(depth.shape, IN_WORKSPACE),
+        ray_x=jnp.asarray(x, jnp.float32),
+        ray_y=jnp.asarray(y, jnp.float32),
+        focal=jnp.full(2, focal),
+        centre=jnp.array([11.5, 8.5]),
+        table=jnp.asarray(depth, jnp.float32),
+        outlier_scale=jnp.float32(LIMITS.outlier_scale),
+        front_margin=jnp.float32(0.01),
+        likelihood=Likelihood("points"),
+    )
+    return Cloud(blank, depth, noise_grid(0.004))
+
+
+def noise_ranks(cloud, scenes, error=1.0, scored=None):
+    """Ranks of the true noise in its posterior given the scene, of points drawn with `error` times the sigma."""
+    rng, samples, ranks = np.random.default_rng(0), 199, []
+    scene = pad_scene(jnp.asarray(cloud.surface if scored is None else scored, jnp.float32), WINDOW)[None]
+    table_of = jax.jit(log_likelihood_scene, static_argnames="window")
+    draw = jax.jit(lambda key, table: sample(key, jnp.repeat(table, samples, 0), cloud.grid))
+    for k in range(scenes):
+        sigma, p_outlier = draw_noise(rng, cloud.grid)
+        rays = np.asarray(cloud.image.ray_x), np.asarray(cloud.image.ray_y)
+        points = draw_points(rng, cloud.surface, *rays, (error * sigma, p_outlier), LIMITS)
+        assert int((points.kind != NO_RETURN).sum()) == cloud.surface.size
+        drawn = draw(jax.random.key(k), table_of(scene, cloud.image._replace(points=points), cloud.grid.coarse, WINDOW))
+        equal = np.full(samples, 1 / samples)
+        ranks.append(
+            [
+                rank(truth, np.asarray(values, float), equal, samples, rng.random())
+                for truth, values in ((sigma, drawn.sigma), (p_outlier, drawn.p_outlier))
+            ]
+        )
+    return np.array(ranks).T
+
+
+def test_free_points_are_of_the_density_that_scores_them(cloud):
+    """Given the scene, the posterior of the noise is calibrated; for noisier points it is not."""
+    assert min(kstest(ranks, "uniform").pvalue for ranks in noise_ranks(cloud, 150)) > 0.01
+    assert kstest(noise_ranks(cloud, 40, error=1.25)[0], "uniform").pvalue < 1e-4
+
+
+def test_where_no_surface_is_must_be_counted(cloud):
+    """Planted: rays that meet nothing are left out of the sum, as when dividing by the surface points alone; the points
+    that they show are then taken for outliers."""
+    nowhere = np.where(np.isfinite(cloud.surface), cloud.surface, 40.0)
+    assert kstest(noise_ranks(cloud, 40, scored=nowhere)[1], "uniform").pvalue < 1e-4

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
 from bayes3d_ros.model.scene_score import (
+    FreePoints,
     Image,
-    add_objects,
+    draw_objects,
     halved,
     log_likelihood_gain,
     log_likelihood_scene,
@@ -21,7 +22,7 @@ WIDTH, HEIGHT, WINDOW = 42, 30, 3  # no multiples of the tiles' side
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.4]))
 
 gain_of = jax.jit(log_likelihood_gain, static_argnames="window")
-added = jax.jit(add_objects, static_argnames="window")
+with_objects = jax.jit(draw_objects, static_argnames="window")
 whole = jax.jit(log_likelihood_scene, static_argnames="window")
 
 
@@ -132,14 +133,11 @@ def test_gain_at_the_rim_of_the_image(gains, at_the_rim):
     np.testing.assert_allclose(gain, expected, atol=0.01, rtol=1e-5)
 
 
-def test_adding_objects(contacts, drawn, ancestors, image, arrays, table):
-    ancestor = np.arange(len(drawn)) % 3
-    scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
-    gain = gain_of(contacts, jnp.asarray(ancestor), scenes, image, arrays, table, NOISE, WINDOW)
-    gains, after, covered = added(contacts, scenes[ancestor], image, arrays, table, NOISE, WINDOW)
-    np.testing.assert_allclose(np.asarray(gains), np.asarray(gain), atol=1e-3, rtol=1e-5)
-    np.testing.assert_array_equal(np.asarray(covered), np.isfinite(drawn).sum((1, 2)))
-    expected = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], drawn)), WINDOW)
+def test_drawing_objects(contacts, drawn, ancestors, image, arrays, table):
+    before = ancestors[np.arange(len(drawn)) % 3]
+    scenes = pad_scene(jnp.asarray(before, jnp.float32), WINDOW)
+    after = with_objects(contacts, scenes, image, arrays, table, WINDOW)
+    expected = pad_scene(jnp.asarray(np.minimum(before, drawn)), WINDOW)
     np.testing.assert_allclose(np.asarray(after), np.asarray(expected), rtol=1e-5)
 
 
@@ -166,3 +164,38 @@ def test_halved(image, contacts, arrays, table):
     np.testing.assert_array_equal(half.depth, image.depth[2 * v[:, None], 2 * u])
     np.testing.assert_array_equal(half.kind, image.kind[2 * v[:, None], 2 * u])
     np.testing.assert_array_equal(half.table, image.table[2 * v[:, None], 2 * u])
+
+
+@pytest.fixture(scope="module")
+def cloud(image):
+    """Free points in two layers: the depth image's, and others beside their pixels' rays, of which some are missing."""
+    rng = np.random.default_rng(3)
+    step = 1 / np.asarray(image.focal)[:, None, None]
+    beside = np.stack([np.zeros((2, HEIGHT, WIDTH)), rng.uniform(-0.5, 0.5, (2, HEIGHT, WIDTH)) * step])
+    depth = np.stack([image.depth, image.depth + rng.normal(0, 0.003, image.depth.shape)])
+    second = jnp.asarray(rng.random(image.kind.shape) < 0.5)
+    kind = jnp.stack([image.kind, jnp.where(second, image.kind, NO_RETURN)])
+    points = FreePoints(jnp.float32(depth), kind, *(jnp.float32(beside[:, a]) for a in range(2)))
+    return image._replace(likelihood=Likelihood("points"), points=points)
+
+
+def test_layers_of_free_points_add_up(ancestors, image, cloud):
+    """Layer by layer; the first, on the rays, is the depth image read as points."""
+    scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
+    both = np.asarray(whole(scenes, cloud, NOISE, WINDOW))
+    layers = (jax.tree.map(lambda a, k=k: a[k : k + 1], cloud.points) for k in range(2))
+    first, second = (np.asarray(whole(scenes, cloud._replace(points=layer), NOISE, WINDOW)) for layer in layers)
+    np.testing.assert_allclose(both, first + second, rtol=1e-5)
+    np.testing.assert_allclose(first, np.asarray(whole(scenes, cloud._replace(points=None), NOISE, WINDOW)), rtol=1e-6)
+    assert np.abs(first - np.asarray(whole(scenes, image, NOISE, WINDOW))).min() > 10
+
+
+def test_gain_of_free_points_is_the_difference_of_whole_clouds(contacts, drawn, ancestors, cloud, arrays, table):
+    ancestor = np.arange(len(drawn)) % 3
+    scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
+    gain = np.asarray(gain_of(contacts, jnp.asarray(ancestor), scenes, cloud, arrays, table, NOISE, WINDOW))
+    after = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], drawn)), WINDOW)
+    before = np.asarray(whole(scenes, cloud, NOISE, WINDOW))[ancestor]
+    expected = np.asarray(whole(after, cloud, NOISE, WINDOW)) - before
+    assert np.ptp(expected[:, 0, 0]) > 100
+    np.testing.assert_allclose(gain, expected, atol=0.02, rtol=1e-5)

@@ -10,6 +10,7 @@ Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
 # Name on the command line -> module; imported when it is run, because it imports jax.
 EXPERIMENTS: dict[str, str] = {
     "calibration": "bayes3d_ros.evaluation.experiments.calibration",
+    "calibration-points": "bayes3d_ros.evaluation.experiments.calibration_points",
     "coverage": "bayes3d_ros.evaluation.experiments.coverage",
     "exactness": "bayes3d_ros.evaluation.experiments.exactness",
     "parsing": "bayes3d_ros.evaluation.experiments.parsing",

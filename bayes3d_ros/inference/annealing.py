@@ -1,0 +1,67 @@
+"""From the proposal to the target by steps: resample and move between them (Del Moral et al. 2006).
+
+The likelihood of an object's pose is sharp and uneven; a mixture that fits it well leaves weights that differ by a few
+nats, one that misses something by tens. So an object is not weighted at once but along the path q^(1-b) target^b, b
+from 0 to 1, with Metropolis-Hastings moves at every b. The exponents come from pilot draws that are thrown away: they
+depend on the image and the ancestor only, and the evidence stays unbiased. Where particles meet a peak that the pilots
+did not, a step is shortened by the particles' own weights: consistent, with a bias that falls as one over their number
+(Beskos et al. 2016), where an unbiased estimate would rest on a single particle.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayes3d_ros.inference.mixture import Modes
+from bayes3d_ros.inference.resampling import effective_fraction
+from bayes3d_ros.model.scene_graph import Contact
+
+LEVELS = 6  # of the plan
+MOST_LEVELS = 16
+TOO_UNEVEN = 0.2  # effective fraction below which a planned step is shortened
+_EVEN = 0.45  # share of the effective draws that a step of the exponent keeps
+_STEP = 0.7  # of a component's scale, a random walk's
+_LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
+
+
+def exponents(log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"]) -> Float[Array, "L"]:
+    """Increasing exponents up to 1 (repeated at the end). Each step keeps nearly half of the effective draws:
+    draws with these weights from q, log_ratio = log target - log q."""
+    log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
+
+    def following(b: Array, _) -> tuple[Array, Array]:
+        c = longest_step(b, jnp.ones_like(b), log_ratio, jax.nn.log_softmax(log_weight + b * log_ratio))
+        return c, c
+
+    return jax.lax.scan(following, jnp.float32(0.0), None, length=LEVELS)[1].at[-1].set(1.0)
+
+
+def longest_step(
+    b: Float[Array, ""], most: Float[Array, ""], log_ratio: Float[Array, "N"], log_weight: Float[Array, "N"]
+) -> Float[Array, ""]:
+    """The largest exponent up to `most` that keeps nearly half of the draws effective that are so now."""
+
+    def enough(c: Array) -> Array:
+        step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
+        return effective_fraction(log_weight + step) >= _EVEN * effective_fraction(log_weight)
+
+    def halve(bounds, _):
+        low, high = bounds
+        middle = b + jnp.sqrt((low - b) * (high - b))  # steps span orders of magnitude
+        good = enough(middle)
+        return (jnp.where(good, middle, low), jnp.where(good, high, middle)), None
+
+    (c, _), _ = jax.lax.scan(halve, (b + 1e-4 * (most - b), most), None, length=12)
+    return jnp.where(enough(most), most, c)
+
+
+def walk(key: PRNGKeyArray, contact: Contact, modes: Modes) -> Contact:
+    """A symmetric random walk in (x, y, yaw), as wide as one of the components of the same type and face, whichever."""
+    choice, noise = jax.random.split(key)
+    count = contact.type.shape[0]
+    same = (contact.type[:, None] == modes.centre.type) & (contact.face[:, None] == modes.centre.face)
+    m = jax.random.categorical(choice, jnp.where(same, modes.log_weight, -jnp.inf))
+    scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(_LOOSE)))
+    step = _STEP * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
+    yaw = jnp.mod(contact.yaw + step[:, 2], 2 * jnp.pi)
+    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=yaw)
