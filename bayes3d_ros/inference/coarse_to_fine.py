@@ -20,9 +20,9 @@ from bayes3d_ros.inference.mode_search import (
     narrow,
     sharpen,
     take,
-    with_half_turns,
+    with_lookalikes,
 )
-from bayes3d_ros.inference.noise import NoiseGrid, log_marginal, peak
+from bayes3d_ros.inference.noise import NoiseGrid, log_marginal, near_peak, peak
 from bayes3d_ros.inference.sketch_search import (
     YAWS,
     Evidence,
@@ -42,6 +42,7 @@ _MODES, _FINALISTS = 8, 4
 _FIT = (24, 3)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
+_BEHIND = 1e6  # nats
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
@@ -95,6 +96,15 @@ def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, flo
     close &= jnp.abs(wrap(contact.yaw[:, None] - contact.yaw)) < near[1]
     better = jnp.tril(same & close, -1)
     return jnp.where(better.any(1), -jnp.inf, score)
+
+
+def _apart(contact: Contact, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
+    """Scores, with all but the `most` best of any place set behind the others: what is seen best must not crowd out
+    what stands elsewhere. Sorted by falling score beforehand."""
+    apart = jnp.hypot(contact.x[:, None] - contact.x, contact.y[:, None] - contact.y)
+    close = apart < library.radius[contact.type]
+    before = jnp.tril(close & jnp.isfinite(score), -1).sum(1)
+    return jnp.where(before < most, score, score - _BEHIND)
 
 
 def candidates(
@@ -165,22 +175,26 @@ def find_proposal(
     def rough(contact: Contact) -> Float[Array, "N"]:
         return 4 * _gains(contact, small_depth, small, noise, window)
 
-    def noise_with(contact: Contact) -> Noise:
-        """The noise level once the first of these objects explains what it does."""
+    def table_with(contact: Contact) -> Float[Array, "S P"]:
+        """The scene's once the first of these objects explains what it does."""
         first = take(contact, slice(1))
         gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
-        return peak(scene.table + gain[0], grid)
+        return scene.table + gain[0]
 
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.contact), -jnp.inf), _CANDIDATES)
-    found, gain = best_first(found, _distinct(found.contact, gain, (0.004, 0.05)), _MODES)
     worth = gain[0] > _WORTH
+    gain = _apart(found.contact, _distinct(found.contact, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
+    found, _ = best_first(found, gain, _MODES)
 
     def search() -> tuple[Modes, Pilots]:
         narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
         modes, value = narrow(narrow_key, found, rough)
         modes, value = best_first(modes, value, _MODES)
-        modes, _ = best_first(modes, _distinct(modes.contact, value, (0.006, 0.15)), _FINALISTS)
-        noise = noise_with(modes.contact)
+        value = _apart(modes.contact, _distinct(modes.contact, value, (0.006, 0.15)), library, _FINALISTS - 1)
+        modes, _ = best_first(modes, value, _FINALISTS)
+        table_then = table_with(modes.contact)
+        noise, near = peak(table_then, grid), near_peak(table_then, grid)
+        rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
 
         def exact(contact: Contact) -> Float[Array, "N"]:
             return _gains(contact, scene.depth, context, noise, window)
@@ -189,16 +203,16 @@ def find_proposal(
             """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of
             the image are compared by thousands of nats; at one noise level that comparison is off by ten."""
             ancestor = jnp.zeros(contact.type.shape, jnp.int32)
-            gain = log_likelihood_gain(contact, ancestor, scene.depth[None], *context, grid.coarse, window)
-            return log_marginal(scene.table + gain, grid)
+            gain = log_likelihood_gain(contact, ancestor, scene.depth[None], *context, near.coarse, window)
+            return log_marginal(scene.table[rows] + gain, near)
 
         modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
         mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
-        return with_half_turns(mixture, exact), pilots
+        return with_lookalikes(mixture, exact, library), pilots
 
     def nothing() -> tuple[Modes, Pilots]:
         modes = as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))
-        mixture = with_half_turns(modes, lambda contact: jnp.zeros(contact.type.shape))
+        mixture = with_lookalikes(modes, lambda contact: jnp.zeros(contact.type.shape), library)
         nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.contact)
         return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))
 

@@ -178,18 +178,29 @@ def adapt(
     return modes, pilots
 
 
-def with_half_turns(modes: Modes, gains: Callable) -> Modes:
-    """Each component, and it turned by 180 degrees about each axis of its box, the four sharing its weight by their log
-    likelihoods: most things look alike that way, or nearly, and a search that found one of them need not find all."""
-    turned = [
-        modes.centre._replace(face=modes.centre.face ^ over, yaw=modes.centre.yaw + about)
-        for over in (0, 1)
-        for about in (0.0, jnp.pi)
-    ]
-    centre = jax.tree.map(lambda *a: jnp.concatenate(a), *turned)
-    value = jnp.maximum(gains(centre), -1e9).reshape(4, -1)
-    share = jnp.logaddexp(jax.nn.log_softmax(value / 2, 0) + jnp.log(0.96), jnp.log(0.01))
-    return Modes(centre, jnp.tile(modes.scale, (4, 1, 1)), (modes.log_weight + share).ravel())
+def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
+    """Each component and the poses in which its object looks alike (`lookalikes.py`), sharing its weight by their log
+    likelihoods: a search that found one of them need not have found the others."""
+    at, scale = modes.centre, modes.scale
+    face = jnp.concatenate([at.face[:, None], library.alike_face[at.type, at.face]], 1)
+    shift = library.alike_shift[at.type, at.face]
+    shift = jnp.concatenate([jnp.zeros_like(shift[:, :1]), shift], 1)
+    c, s = jnp.cos(at.yaw)[:, None], jnp.sin(at.yaw)[:, None]
+    dx, dy = c * shift[..., 0] - s * shift[..., 1], s * shift[..., 0] + c * shift[..., 1]
+    kind = jnp.broadcast_to(at.type[:, None], face.shape)
+    centre = Contact(kind, face, at.x[:, None] + dx, at.y[:, None] + dy, at.yaw[:, None] + shift[..., 2])
+    # A turn of one carries the middle of the other around.
+    zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
+    rows = [jnp.stack(row, -1) for row in ((one, zero, -dy), (zero, one, dx), (zero, zero, one))]
+    carried = jnp.einsum("maij,mjk->maik", jnp.stack(rows, -2), scale)
+    unit = jnp.array(_SMALLEST_SPREAD)
+    carried = carried / unit[:, None]  # metres and radians alike: float32 has no room for both in a square
+    square = jnp.einsum("maij,makj->maik", carried, carried)
+    factor = unit[:, None] * jnp.linalg.cholesky(square + 1e-3 * jnp.eye(3))
+    value = jnp.maximum(gains(jax.tree.map(jnp.ravel, centre)), -1e9).reshape(face.shape)
+    share = jnp.logaddexp(jax.nn.log_softmax(value / 2, 1), jnp.log(0.03 / face.shape[1]))
+    weight = jax.nn.log_softmax((modes.log_weight[:, None] + share).ravel())
+    return Modes(jax.tree.map(jnp.ravel, centre), factor.reshape(-1, 3, 3), weight)
 
 
 def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:

@@ -28,6 +28,7 @@ from bayes3d_ros.model.scene_score import Image
 from bayes3d_ros.model.summaries import summarise
 
 _NEGLIGIBLE = np.log(0.15)  # a number of objects this much less likely than the best ends the search for more
+_NO_SAMPLE = -30.0  # nats: samples of less weight are not kept
 
 
 class _Stage(NamedTuple):
@@ -158,9 +159,10 @@ class SceneParser:
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
         state = smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
-        stages, ess = [self._keep(key, state, context)], []
-        log_mass = [0.0]
+        stages: list[_Stage] = []
+        ess, log_mass = [], [0.0]
         for count in range(last):
+            before = state
             state, info = smc.step(
                 jax.random.fold_in(key, count),
                 state,
@@ -171,18 +173,26 @@ class SceneParser:
                 settings.window,
                 settings.ess_threshold,
             )
-            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), state, context))
             ess.append(float(info.ess))
-            log_mass.append(stages[-1].log_evidence + (count + 1) * np.log(settings.count_ratio))
+            log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
+            matters = log_mass[-2] > log_mass[-1] + _NO_SAMPLE
+            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, matters))
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
                 break
+        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, context))
         if fixed:
             if len(stages) != settings.fixed_objects + 1 or not np.isfinite(stages[-1].log_evidence):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
             stages = stages[-1:]
         return stages, ess
 
-    def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context) -> _Stage:
+    def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context, matters: bool = True) -> _Stage:
+        """A stage's scenes; only its evidence where they do not matter."""
+        if not matters:
+            none = jax.tree.map(lambda a: np.zeros((0, *a.shape[1:]), a.dtype), state.objects)
+            nobody = np.zeros((0, *none.x.shape[1:], 3), np.float32)
+            zero = np.zeros(0, np.float32)
+            return _Stage(none, nobody, np.zeros((0, 3), np.float32), zero, zero, zero, float(state.log_evidence))
         noise = self._sample_noise(key, state.table, self._grid)
         error, window = self._smooth_error, self.settings.window
         offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
@@ -207,7 +217,7 @@ class SceneParser:
         log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
         log_weight -= np.logaddexp.reduce(log_weight)
         n = np.repeat(counts, [len(s.log_weight) for s in stages])
-        keep = np.flatnonzero(log_weight > -30)
+        keep = np.flatnonzero(log_weight > _NO_SAMPLE)
         objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
         offset = np.concatenate([s.offset for s in stages])[keep]
         plane = np.concatenate([s.plane for s in stages])[keep]

@@ -74,7 +74,7 @@ class ParserSettings:
     )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
-    ess_threshold: float = setting(0.5, "resample below this fraction of effective particles", low=0.0, high=1.0)
+    ess_threshold: float = setting(0.3, "resample below this fraction of effective particles", low=0.0, high=1.0)
     seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
 
     def __post_init__(self) -> None:

@@ -47,36 +47,60 @@ def sketch_score(
     """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
     past, relative to the reward of one that matches; the first `points` of the sketch are used."""
     T = T_camera_object(contact, library, table)
-    z, gap, weight, against, facing = _compare(T, contact.type, evidence, image, library, points)
-    matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * weight
-    through = jnp.where(gap > tolerance, jnp.minimum(gap / tolerance - 1, 1.0), 0.0) * against
-    pixels = library.sketch_area[contact.type] * library.sketch.shape[1] / points * image.focal[0] * image.focal[1]
-    return _NATS * pixels * ((matched - penalty * through) * facing / z**2).sum(-1)
+    scale = library.sketch_area[contact.type] * library.sketch.shape[1] / points
+    point, normal = _placed(T, contact.type, library, points)
+    return _score(point, normal, scale, evidence, image, tolerance, penalty)
 
 
-def _compare(T, type_index, evidence, image, library, points):
-    """Depth of sketch points, how far behind them the camera's return lies, and how unexplained that return is.
-    The gap is 0 and the weight 0 where nothing is known."""
-    height, width = evidence.depth.shape
-    sketch = library.sketch[type_index, :points]
+class _Vectors(NamedTuple):
+    """Components along the camera's axes."""
+
+    x: Float[Array, "N P"]
+    y: Float[Array, "N P"]
+    z: Float[Array, "N P"]
+
+
+def _placed(
+    T: Float[Array, "N 4 4"], kind: Int[Array, "N"], library: LibraryArrays, points: int
+) -> tuple[_Vectors, _Vectors]:
+    """The first `points` of the sketch and their normals in the camera frame."""
     rotation, translation = T[:, :3, :3], T[:, :3, 3]
-    x, y, z = (
-        sum(rotation[:, a, b][:, None] * sketch[..., b] for b in range(3)) + translation[:, a][:, None]
-        for a in range(3)
-    )
-    normal = library.sketch_normal[type_index, :points]
-    nx, ny, nz = (sum(rotation[:, a, b][:, None] * normal[..., b] for b in range(3)) for a in range(3))
-    facing = jnp.maximum(-(nx * x + ny * y + nz * z), 0.0) / jnp.sqrt(x * x + y * y + z * z)
-    z = jnp.maximum(z, 0.02)
-    u = jnp.round(x / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
-    v = jnp.round(y / z * image.focal[1] + image.centre[1]).astype(jnp.int32)
+
+    def turned(vectors: Float[Array, "N P 3"]) -> _Vectors:
+        r, (x, y, z) = rotation[..., None], (vectors[..., a] for a in range(3))
+        return _Vectors(*(r[:, a, 0] * x + r[:, a, 1] * y + r[:, a, 2] * z for a in range(3)))
+
+    point = turned(library.sketch[kind, :points])
+    placed = _Vectors(*(along + translation[:, a][:, None] for a, along in enumerate(point)))
+    return placed, turned(library.sketch_normal[kind, :points])
+
+
+def _score(
+    point: _Vectors,
+    normal: _Vectors,
+    area: Float[Array, "N"],
+    evidence: Evidence,
+    image: Image,
+    tolerance: float,
+    penalty: float,
+) -> Float[Array, "N"]:
+    """Rough gain in nats; `area` in metres^2 is what one of the points stands for."""
+    height, width = evidence.depth.shape
+    x, y, z = point
+    facing = jnp.maximum(-(normal.x * x + normal.y * y + normal.z * z), 0.0) * jax.lax.rsqrt(x * x + y * y + z * z)
+    inverse = 1 / jnp.maximum(z, 0.02)
+    u = jnp.round(x * inverse * image.focal[0] + image.centre[0]).astype(jnp.int32)
+    v = jnp.round(y * inverse * image.focal[1] + image.centre[1]).astype(jnp.int32)
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = jnp.clip(v, 0, height - 1) * width + jnp.clip(u, 0, width - 1)
     observed = evidence.depth.ravel()[index]
-    weight = evidence.unexplained.ravel()[index]
-    known = seen & (observed > 0)
-    against = evidence.explained.ravel()[index]
-    return z, jnp.where(known, observed - z, 0.0), jnp.where(known, weight, 0.0), against, facing
+    # What nothing is known of neither matches nor speaks against.
+    known = jnp.where(seen & (observed > 0), facing * inverse**2, 0.0)
+    gap = observed - z
+    matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * evidence.unexplained.ravel()[index]
+    through = jnp.clip(gap / tolerance - 1, 0.0, 1.0) * evidence.explained.ravel()[index]
+    pixels = area * image.focal[0] * image.focal[1]
+    return _NATS * pixels * ((matched - penalty * through) * known).sum(-1)
 
 
 def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
@@ -119,25 +143,30 @@ def score_cells(
     """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
     kinds = library.first.shape[0]
     face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
-    per_cell = NUM_FACES * YAWS
+    ways = NUM_FACES * YAWS
+    tolerance, penalty, points = _COARSE
     blocks = -(-count // _BLOCK)
+    along = [table.T_camera_table[:3, axis] for axis in range(2)]
 
-    def body(step, scores):
-        block, kind = step // library.num_types, step % library.num_types
-        xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))
-        contact = Contact(
-            type=jnp.full(_BLOCK * per_cell, kind),
-            face=jnp.tile(face, _BLOCK),
-            x=jnp.repeat(xy[:, 0], per_cell),
-            y=jnp.repeat(xy[:, 1], per_cell),
-            yaw=jnp.tile((yaw + 0.5) * (2 * jnp.pi / YAWS), _BLOCK),
-        )
-        value = sketch_score(contact, evidence, image, library, table, *_COARSE)
-        value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
-        return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
+    def of_kind(kind: Int[Array, ""], scores: Array) -> Array:
+        zero = jnp.zeros(ways)
+        at_origin = Contact(jnp.full(ways, kind), face, zero, zero, (yaw + 0.5) * (2 * jnp.pi / YAWS))
+        # Turned once for all cells.
+        point, normal = _placed(T_camera_object(at_origin, library, table), at_origin.type, library, points)
+        area = library.sketch_area[kind] * library.sketch.shape[1] / points
+
+        def of_block(block: Int[Array, ""], scores: Array) -> Array:
+            xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))
+            moved = (xy[:, :1] * along[0] + xy[:, 1:] * along[1])[..., None, None]
+            here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
+            value = _score(here, normal, area, evidence, image, tolerance, penalty)
+            value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
+            return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
+
+        return jax.lax.fori_loop(0, blocks, of_block, scores)
 
     scores = jnp.full((centres.shape[0], kinds, NUM_FACES, YAWS), -jnp.inf)
-    return jax.lax.fori_loop(0, blocks * library.num_types, body, scores)
+    return jax.lax.fori_loop(0, library.num_types, of_kind, scores)
 
 
 def hidden_cells(image: Image, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import distance_transform_cdt
 
+from bayes3d_ros.model.lookalikes import lookalikes
 from bayes3d_ros.model.objects import Library, ObjectModel
 
 NUM_FACES = 6
@@ -38,6 +39,8 @@ class LibraryArrays(NamedTuple):
     sketch_normal: Float[Array, "K P 3"]
     sketch_area: Float[Array, "K"]  # metres^2 that one of them stands for
     solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
+    alike_face: Int[Array, "K 6 A"]  # contacts that look like each other (`lookalikes.py`)
+    alike_shift: Float[Array, "K 6 A 3"]  # along the contact's own x and y, and yaw
 
 
 def contact_transform(model: ObjectModel, face: int) -> Float[np.ndarray, "4 4"]:
@@ -84,6 +87,8 @@ def library_arrays(library: Library) -> LibraryArrays:
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
     sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
     grids = [pack_voxels(m) for m in models]
+    T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
+    alike = [lookalikes(m.surface_points, T) for m, T in zip(models, T_contact_object, strict=True)]
     first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
     words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
     words[: first[-1]] = np.concatenate(grids)
@@ -99,13 +104,15 @@ def library_arrays(library: Library) -> LibraryArrays:
         dims=stack([np.array(m.occupancy.shape) for m in models], np.int32),
         voxel_size=stack([np.float32(m.voxel_size) for m in models]),
         origin=stack([m.origin for m in models]),
-        T_contact_object=stack([np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]),
+        T_contact_object=stack(T_contact_object),
         face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
         radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
         sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
         sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),
         sketch_area=stack([np.float32(len(m.surface_index) * m.voxel_size**2 / SKETCH_POINTS) for m in models]),
         solid=stack([p[_spread(p, SOLID_POINTS)] for p in map(_inside, models)]),
+        alike_face=stack([a.face for a in alike], np.int32),
+        alike_shift=stack([a.shift for a in alike]),
     )
 
 
