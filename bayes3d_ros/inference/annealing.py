@@ -20,7 +20,7 @@ LEVELS = 6  # of the plan
 MOST_LEVELS = 16
 TOO_UNEVEN = 0.2  # effective fraction below which a planned step is shortened
 _EVEN = 0.45  # share of the effective draws that a step of the exponent keeps
-_STEP = 0.7  # of a component's scale, a random walk's
+_STEPS = (0.05, 1.0)  # of a component's scale, a random walk's: the likelihood's peaks are of all widths
 _LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
 
 
@@ -57,11 +57,13 @@ def longest_step(
 
 def walk(key: PRNGKeyArray, contact: Contact, modes: Modes) -> Contact:
     """A symmetric random walk in (x, y, yaw), as wide as one of the components of the same type and face, whichever."""
-    choice, noise = jax.random.split(key)
+    choice, noise, size = jax.random.split(key, 3)
     count = contact.type.shape[0]
     same = (contact.type[:, None] == modes.centre.type) & (contact.face[:, None] == modes.centre.face)
     m = jax.random.categorical(choice, jnp.where(same, modes.log_weight, -jnp.inf))
     scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(_LOOSE)))
-    step = _STEP * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
+    low, high = jnp.log(jnp.array(_STEPS))
+    length = jnp.exp(low + (high - low) * jax.random.uniform(size, (count, 1)))
+    step = length * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
     yaw = jnp.mod(contact.yaw + step[:, 2], 2 * jnp.pi)
     return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=yaw)

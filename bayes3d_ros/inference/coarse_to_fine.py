@@ -11,6 +11,7 @@ from bayes3d_ros.inference.alignment import align
 from bayes3d_ros.inference.annealing import LEVELS, exponents
 from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, log_density, wrap
 from bayes3d_ros.inference.mode_search import (
+    FINALISTS,
     PILOT_DRAWS,
     Hypotheses,
     Pilots,
@@ -38,7 +39,7 @@ from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
 from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
 
 _GLOBAL, _QUARTERS, _CANDIDATES = 64, 4, 32
-_MODES, _FINALISTS = 8, 4
+_MODES = 8
 _FIT = (24, 3)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
@@ -190,8 +191,8 @@ def find_proposal(
         narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
         modes, value = narrow(narrow_key, found, rough)
         modes, value = best_first(modes, value, _MODES)
-        value = _apart(modes.contact, _distinct(modes.contact, value, (0.006, 0.15)), library, _FINALISTS - 1)
-        modes, _ = best_first(modes, value, _FINALISTS)
+        value = _apart(modes.contact, _distinct(modes.contact, value, (0.006, 0.15)), library, FINALISTS - 1)
+        modes, _ = best_first(modes, value, FINALISTS)
         table_then = table_with(modes.contact)
         noise, near = peak(table_then, grid), near_peak(table_then, grid)
         rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
@@ -211,7 +212,7 @@ def find_proposal(
         return with_lookalikes(mixture, exact, library), pilots
 
     def nothing() -> tuple[Modes, Pilots]:
-        modes = as_mixture(take(found, slice(_FINALISTS)), jnp.zeros(_FINALISTS))
+        modes = as_mixture(take(found, slice(FINALISTS)), jnp.zeros(FINALISTS))
         mixture = with_lookalikes(modes, lambda contact: jnp.zeros(contact.type.shape), library)
         nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.contact)
         return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))

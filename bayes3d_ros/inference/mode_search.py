@@ -10,11 +10,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes, refit
 from bayes3d_ros.inference.resampling import effective_fraction
 from bayes3d_ros.model.library_arrays import LibraryArrays
+from bayes3d_ros.model.lookalikes import ALIKE
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
 
 Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
 _PILOT_ROUNDS, PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
+FINALISTS = 4
+COMPONENTS = FINALISTS * (1 + ALIKE)
 _INFLATION, _FLATTEN = 1.5, 4.0
 _TRUST = 0.5  # in the pilots' word on a mode's mass: they are few
 _EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find

@@ -16,14 +16,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, longest_step, walk
 from bayes3d_ros.inference.coarse_to_fine import Context, Scene, conflicts, find_proposal
-from bayes3d_ros.inference.mixture import Proposal, log_density, propose
+from bayes3d_ros.inference.mixture import Modes, Proposal, log_density, propose
+from bayes3d_ros.inference.mode_search import COMPONENTS
 from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.ordering import empty_table, gain_alone, log_last
+from bayes3d_ros.inference.rejuvenation import Scenes, rejuvenate
 from bayes3d_ros.inference.resampling import effective_fraction, systematic
 from bayes3d_ros.model.scene_graph import Contact, log_prior
-from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
-_LAST_FLOOR = 0.02
 _MOVES = 2  # once resampled at the target: a fresh draw and a walk; on the way there one of them, in turn
 
 
@@ -37,6 +39,7 @@ class State(NamedTuple):
     log_likelihood: Float[Array, "N"]  # noise integrated out
     log_weight: Float[Array, "N"]  # normalised
     log_evidence: Float[Array, ""]  # of k objects, relative to the empty table
+    modes: Modes  # [M, C], of the proposal of each stage
 
 
 class Info(NamedTuple):
@@ -44,14 +47,6 @@ class Info(NamedTuple):
 
     ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
     best_gain: Float[Array, ""]  # nats over the ancestor
-
-
-class Empty(NamedTuple):
-    """The empty table."""
-
-    scene: Float[Array, "1 Hp Wp"]
-    table: Float[Array, "1 S P"]
-    log_likelihood: Float[Array, "1"]
 
 
 class _Extended(NamedTuple):
@@ -65,19 +60,13 @@ class _Extended(NamedTuple):
     log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
 
 
-def empty_table(context: Context, grid: NoiseGrid, window: int) -> Empty:
-    scene = pad_scene(context.image.table, window)[None]
-    table = log_likelihood_scene(scene, context.image, grid.coarse, window)
-    table = table - table.max()
-    return Empty(scene, table, noise_model.log_marginal(table, grid))
-
-
 @partial(jax.jit, static_argnames=("particles", "max_objects", "window"))
 def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, window: int) -> State:
     """The empty table."""
     empty = empty_table(context, grid, window)
     slots = (particles, max_objects)
     none, zero = jnp.full(slots, -1, jnp.int32), jnp.zeros(slots)
+    none_yet = jnp.full((max_objects, COMPONENTS), -1, jnp.int32)
 
     def everywhere(a: Array) -> Array:
         return jnp.broadcast_to(a, (particles, *a.shape[1:]))
@@ -90,6 +79,11 @@ def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, wi
         log_likelihood=everywhere(empty.log_likelihood),
         log_weight=jnp.full(particles, -jnp.log(particles), jnp.float32),
         log_evidence=jnp.float32(0.0),
+        modes=Modes(
+            Contact(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
+            jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
+            jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
+        ),
     )
 
 
@@ -107,7 +101,7 @@ def step(
     """Add an object to scenes that hold `count` of them."""
     image, library, table = context
     particles = state.log_weight.shape[0]
-    resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
+    resample_key, search_key, draw_key, anneal_key, move_key = jax.random.split(key, 5)
     ancestor, log_weight = _resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
@@ -129,18 +123,29 @@ def step(
     end, log_weight, log_evidence, ess = _anneal(
         anneal_key, start, log_weight, exponents, extend, proposal, context, ess_threshold
     )
-    alone = state.alone[end.ancestor]
-    alone = jax.lax.cond(
+    empty = empty_table(context, grid, window)
+    own = jax.lax.cond(
         count == 0,
-        lambda: alone.at[:, 0].set(end.log_likelihood - state.log_likelihood[end.ancestor]),
-        lambda: _gain_alone(end.new, alone, count, context, grid, window),
+        lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
+        lambda: gain_alone(end.new, empty, context, grid, window),
     )
-    log_weight, last = _normalised(log_weight + _log_last(alone, count))
+    alone = state.alone[end.ancestor].at[:, count].set(own)
+    log_weight, last = _normalised(log_weight + log_last(alone, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
     scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
-    log_evidence = state.log_evidence + log_evidence + last
-    following = State(objects, alone, scenes, end.table, end.log_likelihood, log_weight, log_evidence)
+    modes = jax.tree.map(lambda a, b: a.at[count].set(b), state.modes, proposal.modes)
+    gained = log_evidence + last
+    placed = Scenes(objects, alone, scenes, end.table, end.log_likelihood)
+    # An object that the image does not bear out is no reason to move the others.
+    placed = jax.lax.cond(
+        (count > 0) & (gained > 0),
+        lambda: rejuvenate(
+            move_key, placed, log_weight, modes, count + 1, empty, context, grid, window, OVERLAP_LIMIT
+        ),
+        lambda: placed,
+    )
+    following = State(**placed._asdict(), log_weight=log_weight, log_evidence=state.log_evidence + gained, modes=modes)
     return following, Info(ess, best)
 
 
@@ -203,20 +208,3 @@ def _move(
     log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(afresh, 0.0, to.log_q - at.log_q)
     accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
     return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
-
-
-def _gain_alone(
-    new: Contact, alone: Float[Array, "N M"], count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
-) -> Float[Array, "N M"]:
-    """Nats that the new object, slot `count`, gains over the empty table."""
-    empty = empty_table(context, grid, window)
-    gain = log_likelihood_gain(new, jnp.zeros_like(new.type), empty.scene, *context, grid.coarse, window)
-    return alone.at[:, count].set(noise_model.log_marginal(empty.table + gain, grid) - empty.log_likelihood)
-
-
-def _log_last(alone: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
-    """log of k times the backward kernel: the chance that the object in slot `count` came last of the k = count + 1."""
-    present = jnp.arange(alone.shape[1]) <= count
-    share = jax.nn.softmax(jnp.where(present, -alone, -jnp.inf), 1)
-    share = (1 - _LAST_FLOOR) * share + _LAST_FLOOR * present / (count + 1)
-    return jnp.log((count + 1) * share[:, count])
