@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayes3d_ros.inference.mixture import Modes
 from bayes3d_ros.inference.resampling import effective_fraction
+from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.scene_graph import Contact
 
 LEVELS = 6  # of the plan
@@ -67,3 +68,19 @@ def walk(key: PRNGKeyArray, contact: Contact, modes: Modes) -> Contact:
     step = length * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
     yaw = jnp.mod(contact.yaw + step[:, 2], 2 * jnp.pi)
     return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=yaw)
+
+
+def jump(key: PRNGKeyArray, contact: Contact, library: LibraryArrays) -> Contact:
+    """To one of the poses in which the object looks alike, whichever. Each has a way back: this is symmetric."""
+    ways = library.alike_face.shape[2]
+    way = jax.random.randint(key, contact.type.shape, 0, ways)
+    kind, face = jnp.maximum(contact.type, 0), jnp.maximum(contact.face, 0)
+    shift = library.alike_shift[kind, face, way]
+    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
+    return Contact(
+        contact.type,
+        library.alike_face[kind, face, way],
+        contact.x + c * shift[:, 0] - s * shift[:, 1],
+        contact.y + s * shift[:, 0] + c * shift[:, 1],
+        jnp.mod(contact.yaw + shift[:, 2], 2 * jnp.pi),
+    )

@@ -2,9 +2,9 @@
 
 A population that is resampled stage by stage ends with few ancestors, and an object that was placed before its
 neighbours were known need not fit beside them. Metropolis-Hastings moves it with everything else held: to a fresh draw
-from its own stage's mixture (another mode), then by random walks. The target is that of the sampler's lists, p_k times
-the backward kernels of all stages, so weights stay what they are. One object a stage is moved, the one of which the
-fewest placements are left.
+from its own stage's mixture or to where it looks alike, then by a random walk. The target is that of the sampler's
+lists, p_k times the backward kernels of all stages, so weights stay what they are. One object a stage is moved, the one
+of which the fewest placements are left.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.inference.annealing import walk
+from bayes3d_ros.inference.annealing import jump, walk
 from bayes3d_ros.inference.coarse_to_fine import Context, conflicts
 from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes
 from bayes3d_ros.inference.noise import NoiseGrid, log_marginal
@@ -22,7 +22,7 @@ from bayes3d_ros.model.scene_graph import Contact, log_prior
 from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain
 
 FEW = 0.25  # effective fraction of distinct placements below which an object is moved
-_MOVES = 3  # a fresh draw, then walks
+_MOVES = 2  # a fresh draw or a jump, then a walk
 _APART = 60.0  # nats between objects' own gains, beyond which a move does not change which came last
 
 
@@ -130,10 +130,12 @@ def _move(
     now = placed(mine, state.table, state.alone)
 
     def step(move: Array, now: _Placed) -> _Placed:
-        draw_key, accept_key = jax.random.split(jax.random.fold_in(key, move))
-        fresh = move == 0
-        drawn, walked = draw_modes(draw_key, modes, particles), walk(draw_key, now.contact, modes)
-        contact = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), drawn, walked)
+        draw_key, which_key, accept_key = jax.random.split(jax.random.fold_in(key, move), 3)
+        first = move == 0
+        fresh = first & (jax.random.uniform(which_key, (particles,)) < 0.5)
+        walked = walk(draw_key, now.contact, modes)
+        moved = jax.tree.map(lambda a, b: jnp.where(first, a, b), jump(draw_key, now.contact, library), walked)
+        contact = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), draw_modes(draw_key, modes, particles), moved)
         alone = jax.lax.cond(
             unclear,
             lambda: state.alone.at[:, m].set(gain_alone(contact, empty, context, grid, window)),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
-from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, longest_step, walk
+from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, jump, longest_step, walk
 from bayes3d_ros.inference.coarse_to_fine import Context, Scene, conflicts, find_proposal
 from bayes3d_ros.inference.mixture import Modes, Proposal, log_density, propose
 from bayes3d_ros.inference.mode_search import COMPONENTS
@@ -26,7 +26,7 @@ from bayes3d_ros.model.scene_graph import Contact, log_prior
 from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
-_MOVES = 2  # once resampled at the target: a fresh draw and a walk; on the way there one of them, in turn
+_MOVES = 2  # once resampled at the target; on the way there one
 
 
 class State(NamedTuple):
@@ -186,7 +186,7 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
 
         def move(number: Array, extended: _Extended) -> _Extended:
             move_key = jax.random.fold_in(level_key, number)
-            return _move(move_key, extended, c, (level + number) % 2 == 0, extend, proposal, context)
+            return _move(move_key, extended, c, (level + number) % 3, extend, proposal, context)
 
         moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
         extended = jax.lax.fori_loop(0, moves, move, extended)
@@ -198,13 +198,20 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
 
 
 def _move(
-    key: PRNGKeyArray, at: _Extended, b: Array, afresh: Array, extend, proposal: Proposal, context: Context
+    key: PRNGKeyArray, at: _Extended, b: Array, kind: Array, extend, proposal: Proposal, context: Context
 ) -> _Extended:
-    """Metropolis-Hastings of the new object under q^(1-b) target^b: a fresh draw from q, or a walk."""
-    fresh_key, walk_key, accept_key = jax.random.split(key, 3)
-    drawn = propose(fresh_key, proposal, at.ancestor.shape[0], context.library, context.table)
-    walked = walk(walk_key, at.new, proposal.modes)
-    to = extend(at.ancestor, jax.tree.map(lambda a, b: jnp.where(afresh, a, b), drawn, walked))
-    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(afresh, 0.0, to.log_q - at.log_q)
+    """Metropolis-Hastings of the new object under q^(1-b) target^b. `kind`: 0 a jump to where it looks alike, 1 a walk,
+    2 a fresh draw from q."""
+    draw_key, accept_key = jax.random.split(key)
+    new = jax.lax.switch(
+        kind,
+        (
+            lambda: jump(draw_key, at.new, context.library),
+            lambda: walk(draw_key, at.new, proposal.modes),
+            lambda: propose(draw_key, proposal, at.ancestor.shape[0], context.library, context.table),
+        ),
+    )
+    to = extend(at.ancestor, new)
+    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
     accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
     return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)

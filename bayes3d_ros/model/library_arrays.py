@@ -88,7 +88,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
     grids = [pack_voxels(m) for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
-    alike = [lookalikes(m.surface_points, T) for m, T in zip(models, T_contact_object, strict=True)]
+    alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
     first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
     words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
     words[: first[-1]] = np.concatenate(grids)

@@ -10,12 +10,13 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 ALIKE = 7  # kept for every face
-_TURNS = 30
-_POINTS = 40
-_ROUNDS = 5
-_PROMISING = 0.014  # metres, before alignment
+_TURNS = 60
+_POINTS = 64
+_ROUNDS = 5  # of halving the step in yaw
+_SLIDES = 3  # at the end
 _ALIKE_WITHIN = 0.006  # metres, root mean square between the surfaces
 _FAR = 0.02  # metres: farther is no worse
+_HALF_TURN = 0.1  # radians off one
 _SAME_TURN = 0.35  # radians: closer poses on one face are one mode
 
 
@@ -27,31 +28,44 @@ class Lookalikes(NamedTuple):
     shift: Float[np.ndarray, "6 A 3"]
 
 
-def lookalikes(surface: Float[np.ndarray, "S 3"], T_contact_object: Float[np.ndarray, "6 4 4"]) -> Lookalikes:
-    """Compare the surface resting on every face and at every turn with itself; the best are aligned to it."""
-    tree = cKDTree(surface)
-    some = surface[np.linspace(0, len(surface) - 1, min(_POINTS, len(surface))).astype(int)]
+class _Surface(NamedTuple):
+    points: Float[np.ndarray, "S 3"]
+    normals: Float[np.ndarray, "S 3"]
+    tree: cKDTree
+
+
+def lookalikes(
+    points: Float[np.ndarray, "S 3"], normals: Float[np.ndarray, "S 3"], T_contact_object: Float[np.ndarray, "6 4 4"]
+) -> Lookalikes:
+    """Compare the surface resting on every face and at every turn with itself; the best turns are made finer."""
+    surface = _Surface(points, normals, cKDTree(points))
+    some = points[np.linspace(0, len(points) - 1, min(_POINTS, len(points))).astype(int)]
     resting = [some @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
-    whole = [surface @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
+    whole = [points @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
     extent = np.array([np.ptp(w[:, 2]) for w in whole])
     middle = np.array([0.5 * (w.max(0) + w.min(0))[:2] for w in whole])
     faces = len(T_contact_object)
     found = Lookalikes(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    turn = np.arange(_TURNS) * 2 * np.pi / _TURNS
+    c, s = np.cos(turn), np.sin(turn)
     for face, T in enumerate(T_contact_object):
-        others = [f for f in range(faces) if abs(extent[f] - extent[face]) < 2 * _ALIKE_WITHIN]
         best: list[tuple[float, int, np.ndarray]] = []
-        for other in others:
-            turn = np.arange(_TURNS) * 2 * np.pi / _TURNS
-            c, s = np.cos(turn), np.sin(turn)
+        for other in [f for f in range(faces) if abs(extent[f] - extent[face]) < 2 * _ALIKE_WITHIN]:
             x, y = middle[other]
             turned = np.stack([c * x - s * y, s * x + c * y], 1)
             shift = np.concatenate([middle[face] - turned, turn[:, None]], 1)
-            shift, error = _aligned(shift, resting[other], T, surface, tree)
-            shift = shift[error < _PROMISING]
-            if not len(shift):
-                continue
-            for _ in range(_ROUNDS):
-                shift, error = _aligned(shift, resting[other], T, surface, tree)
+            shift, error = _slid(shift, resting[other], T, surface)
+            lowest = (error <= np.roll(error, 1)) & (error <= np.roll(error, -1)) & (error < 2 * _ALIKE_WITHIN)
+            shift, error = shift[lowest], error[lowest]
+            for halving in range(_ROUNDS if len(shift) else 0):
+                step = np.array([0, 0, np.pi / _TURNS / 2**halving])
+                tried = [_slid(shift + sign * step, resting[other], T, surface) for sign in (-1, 0, 1)]
+                errors = np.stack([e for _, e in tried])
+                pick = errors.argmin(0)
+                shift = np.stack([a for a, _ in tried])[pick, np.arange(len(shift))]
+                error = errors.min(0)
+            for _ in range(_SLIDES if len(shift) else 0):
+                shift, error = _slid(shift, resting[other], T, surface)
             best += [(e, other, row) for e, row in zip(error, shift, strict=True) if e < _ALIKE_WITHIN]
         chosen: list[tuple[int, np.ndarray]] = [(face, np.zeros(3))]  # itself needs no place
         for _, other, row in sorted(best, key=lambda b: b[0]):
@@ -59,30 +73,68 @@ def lookalikes(surface: Float[np.ndarray, "S 3"], T_contact_object: Float[np.nda
                 chosen.append((other, row))
         for place, (other, row) in enumerate(chosen[1:]):
             found.face[face, place], found.shift[face, place] = other, row
-    return found
+    return _reversible(found)
+
+
+def _reversible(found: Lookalikes) -> Lookalikes:
+    """Only ways that lead back exactly: of (a to b, b to a) one is made the other's inverse, a lone one gets an inverse
+    where there is room and is dropped where there is none. A sampler may then jump along them."""
+    faces = len(found.face)
+    paired = Lookalikes(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    room = [ALIKE] * faces
+
+    def add(face: int, other: int, shift: Float[np.ndarray, "3"]) -> None:
+        place = ALIKE - room[face]
+        paired.face[face, place], paired.shift[face, place] = other, shift
+        room[face] -= 1
+
+    for place in range(ALIKE):  # the best of every face first
+        for face in range(faces):
+            other, shift = int(found.face[face, place]), found.shift[face, place]
+            if other == face and not shift.any():
+                continue
+            known = zip(paired.face[face], paired.shift[face], strict=True)
+            if any(other == f and s.any() and abs(_wrapped(shift[2] - s[2])) < _SAME_TURN for f, s in known):
+                continue
+            own = other == face and abs(_wrapped(shift[2] - np.pi)) < _HALF_TURN  # a half turn is its own way back
+            shift = np.array([*shift[:2], np.pi]) if own else shift
+            back = _inverse(shift)
+            if room[face] and (own or room[other] - (other == face)):
+                add(face, other, shift)
+                if not own:
+                    add(other, face, back)
+    return paired
+
+
+def _inverse(shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    c, s = np.cos(shift[2]), np.sin(shift[2])
+    return np.array([-(c * shift[0] + s * shift[1]), -(-s * shift[0] + c * shift[1]), -shift[2]])
 
 
 def _wrapped(angle: float) -> float:
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _aligned(shift, points, T_contact_object, surface, tree):
-    """One round of nearest points and the planar motion that fits them best; the error is of the motion given."""
+def _slid(
+    shift: Float[np.ndarray, "T 3"],
+    points: Float[np.ndarray, "P 3"],
+    T_contact_object: Float[np.ndarray, "4 4"],
+    surface: _Surface,
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T"]]:
+    """One round of sliding the points to where they lie on the surface, and how far off it they were before."""
     c, s = np.cos(shift[:, 2:]), np.sin(shift[:, 2:])
     x = c * points[:, 0] - s * points[:, 1] + shift[:, :1]
     y = s * points[:, 0] + c * points[:, 1] + shift[:, 1:2]
     at = np.stack([x, y, np.broadcast_to(points[:, 2], x.shape)], -1)
     local = (at - T_contact_object[:3, 3]) @ T_contact_object[:3, :3]
-    distance, index = tree.query(local.reshape(-1, 3), distance_upper_bound=_FAR)
-    distance, index = distance.reshape(x.shape), np.minimum(index, len(surface) - 1).reshape(x.shape)
-    found = np.isfinite(distance)[..., None]
-    error = np.sqrt((np.minimum(distance, _FAR) ** 2).mean(1))
-    near = surface[index] @ T_contact_object[:3, :3].T + T_contact_object[:3, 3]
-    count = np.maximum(found.sum(1, keepdims=True), 1)
-    a0, b0 = ((p[..., :2] * found).sum(1, keepdims=True) / count for p in (at, near))
-    u, v = (at[..., :2] - a0) * found, (near[..., :2] - b0) * found
-    turn = np.arctan2((u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]).sum(1), (u * v).sum((1, 2)))
-    c, s = np.cos(turn), np.sin(turn)
-    arm = shift[:, :2] - a0[:, 0]
-    moved = np.stack([c * arm[:, 0] - s * arm[:, 1], s * arm[:, 0] + c * arm[:, 1]], 1) + b0[:, 0]
-    return np.concatenate([moved, (shift[:, 2] + turn)[:, None]], 1), error
+    distance, index = surface.tree.query(local.reshape(-1, 3), distance_upper_bound=_FAR)
+    distance, index = distance.reshape(x.shape), np.minimum(index, len(surface.points) - 1).reshape(x.shape)
+    along = surface.normals[index]
+    off = (along * (surface.points[index] - local)).sum(-1)  # to the surface's plane: its points lie a voxel apart
+    near = np.isfinite(distance)
+    off = np.where(near, np.where(distance < 0.5 * _FAR, off, np.copysign(np.minimum(distance, _FAR), off)), 0.0)
+    error = np.sqrt(np.where(near, off**2, _FAR**2).mean(1))
+    normal = (along @ T_contact_object[:3, :3].T)[..., :2] * near[..., None]
+    square = np.einsum("tpa,tpb->tab", normal, normal) + 0.5 * np.eye(2)
+    slide = np.linalg.solve(square, (normal * off[..., None]).sum(1)[..., None])[..., 0]
+    return shift + np.concatenate([slide, np.zeros((len(shift), 1))], 1), error

@@ -13,7 +13,7 @@ from bayes3d_ros.model.mesh_import import model_from_mesh
 def of(mesh):
     model = model_from_mesh(mesh, "thing", 0.004)
     T = np.stack([contact_transform(model, face) for face in range(NUM_FACES)])
-    return model, T, lookalikes(model.surface_points, T)
+    return model, T, lookalikes(model.surface_points, model.surface_normal, T)
 
 
 def others(found, face):
@@ -62,3 +62,38 @@ def test_a_box_has_three_half_turns():
 def test_a_thing_without_symmetry_looks_like_nothing_else():
     _, _, found = of(wedge())
     assert all(not others(found, face) for face in range(NUM_FACES))
+
+
+def test_every_way_leads_back():
+    """Jumping there and by one of the other's ways back is no move at all."""
+    for mesh in (trimesh.creation.box((0.05, 0.08, 0.12)), trimesh.creation.cylinder(0.03, 0.1)):
+        _, _, found = of(mesh)
+        for face in range(NUM_FACES):
+            for other, (x, y, yaw) in others(found, face):
+                c, s = np.cos(yaw), np.sin(yaw)
+                returns = [
+                    (back == face)
+                    and np.allclose([x + c * a - s * b, y + s * a + c * b], 0, atol=1e-9)
+                    and np.isclose(np.cos(yaw + turn), 1)
+                    for back, (a, b, turn) in others(found, other)
+                ]
+                assert sum(returns) == 1
+
+
+def test_a_mug_without_a_bottom_is_its_mirror_image_upside_down():
+    """Turned about its handle's axis it is itself: the handle points the same way again."""
+    wall = trimesh.creation.annulus(0.028, 0.038, 0.09)
+    handle = trimesh.creation.box((0.03, 0.012, 0.06)).apply_translation((0.05, 0, 0))
+    model, T, found = of(trimesh.util.concatenate([wall, handle]))
+    upright = [f for f in range(NUM_FACES) if abs((T[f][:3, :3] @ [0, 0, 1])[2]) > 0.99]
+    assert len(upright) == 2
+    for face in upright:
+        other, (_, _, yaw) = others(found, face)[0]
+        assert other == sum(upright) - face
+
+        def handle_at(f):
+            x, y, _ = T[f][:3, :3] @ [1, 0, 0]
+            return np.arctan2(y, x)
+
+        off = handle_at(other) + yaw - handle_at(face)
+        assert abs(np.degrees((off + np.pi) % (2 * np.pi) - np.pi)) < 2
