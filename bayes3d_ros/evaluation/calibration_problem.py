@@ -163,6 +163,9 @@ def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
                 settings.ess_threshold,
             )
             ess.append(float(info.ess))
+        if number > 1:
+            refresh_key = jax.random.fold_in(key, 2000 + number)
+            state = smc.refresh(refresh_key, state, jnp.int32(number), context, problem.grid, settings.window)
         noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, problem.grid)
         log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
         stages.append(

@@ -19,8 +19,8 @@ from bayes3d_ros.model.scene_graph import Contact
 
 LEVELS = 6  # of the plan
 MOST_LEVELS = 16
-TOO_UNEVEN = 0.2  # effective fraction below which a planned step is shortened
-_EVEN = 0.45  # share of the effective draws that a step of the exponent keeps
+TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
+_EVEN = 0.33  # share of the effective draws that a step of the exponent keeps
 _STEPS = (0.05, 1.0)  # of a component's scale, a random walk's: the likelihood's peaks are of all widths
 _LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
 

@@ -3,8 +3,8 @@
 A population that is resampled stage by stage ends with few ancestors, and an object that was placed before its
 neighbours were known need not fit beside them. Metropolis-Hastings moves it with everything else held: to a fresh draw
 from its own stage's mixture or to where it looks alike, then by a random walk. The target is that of the sampler's
-lists, p_k times the backward kernels of all stages, so weights stay what they are. One object a stage is moved, the one
-of which the fewest placements are left.
+lists, p_k times the backward kernels of all stages, so weights stay what they are. One object is
+moved, the one of which the fewest placements are left.
 """
 
 from typing import NamedTuple

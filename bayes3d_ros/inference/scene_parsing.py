@@ -176,15 +176,26 @@ class SceneParser:
             ess.append(float(info.ess))
             log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
             matters = log_mass[-2] > log_mass[-1] + _NO_SAMPLE
+            if log_mass[-2] == max(log_mass):
+                before = self._refreshed(key, before, count, context)
             stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, matters))
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
                 break
+        if log_mass[-1] == max(log_mass):
+            state = self._refreshed(key, state, len(ess), context)
         stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, context))
         if fixed:
             if len(stages) != settings.fixed_objects + 1 or not np.isfinite(stages[-1].log_evidence):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
             stages = stages[-1:]
         return stages, ess
+
+    def _refreshed(self, key: PRNGKeyArray, state: smc.State, count: int, context: Context) -> smc.State:
+        """The likeliest number of objects, with one of them moved; a single object was moved when it was added."""
+        if count < 2:
+            return state
+        key = jax.random.fold_in(key, 2000 + count)
+        return smc.refresh(key, state, jnp.int32(count), context, self._grid, self.settings.window)
 
     def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context, matters: bool = True) -> _Stage:
         """A stage's scenes; only its evidence where they do not matter."""

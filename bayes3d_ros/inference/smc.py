@@ -101,7 +101,7 @@ def step(
     """Add an object to scenes that hold `count` of them."""
     image, library, table = context
     particles = state.log_weight.shape[0]
-    resample_key, search_key, draw_key, anneal_key, move_key = jax.random.split(key, 5)
+    resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
     ancestor, log_weight = _resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
@@ -135,18 +135,29 @@ def step(
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
     scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
     modes = jax.tree.map(lambda a, b: a.at[count].set(b), state.modes, proposal.modes)
-    gained = log_evidence + last
-    placed = Scenes(objects, alone, scenes, end.table, end.log_likelihood)
-    # An object that the image does not bear out is no reason to move the others.
-    placed = jax.lax.cond(
-        (count > 0) & (gained > 0),
-        lambda: rejuvenate(
-            move_key, placed, log_weight, modes, count + 1, empty, context, grid, window, OVERLAP_LIMIT
-        ),
-        lambda: placed,
+    return State(
+        objects=objects,
+        alone=alone,
+        scenes=scenes,
+        table=end.table,
+        log_likelihood=end.log_likelihood,
+        log_weight=log_weight,
+        log_evidence=state.log_evidence + log_evidence + last,
+        modes=modes,
+    ), Info(ess, best)
+
+
+@partial(jax.jit, static_argnames="window")
+def refresh(
+    key: PRNGKeyArray, state: State, count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
+) -> State:
+    """The same posterior of scenes of `count` objects, that object moved of which the fewest placements are left."""
+    empty = empty_table(context, grid, window)
+    scenes = Scenes(state.objects, state.alone, state.scenes, state.table, state.log_likelihood)
+    moved = rejuvenate(
+        key, scenes, state.log_weight, state.modes, count, empty, context, grid, window, OVERLAP_LIMIT
     )
-    following = State(**placed._asdict(), log_weight=log_weight, log_evidence=state.log_evidence + gained, modes=modes)
-    return following, Info(ess, best)
+    return state._replace(**moved._asdict())
 
 
 def _resample(key, tree, log_weight, threshold):
