@@ -93,7 +93,8 @@ def test_evidence_of_one_object(scene, grid, noisy):
     ]
     mean, error = ratio_and_error(estimates, enumerate_evidence(context, grid, empty))
     assert error < 0.15
-    assert mean == pytest.approx(1, abs=3 * error + 0.02)
+    # The enumeration's middles of cells are good to a tenth; test_exactness.py holds the sampler to a finer one.
+    assert mean == pytest.approx(1, abs=3 * error + 0.1)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ EXPERIMENTS: dict[str, str] = {
     "calibration": "bayes3d_ros.evaluation.experiments.calibration",
     "calibration-points": "bayes3d_ros.evaluation.experiments.calibration_points",
     "coverage": "bayes3d_ros.evaluation.experiments.coverage",
+    "dial": "bayes3d_ros.evaluation.experiments.dial",
     "exactness": "bayes3d_ros.evaluation.experiments.exactness",
     "parsing": "bayes3d_ros.evaluation.experiments.parsing",
 }
