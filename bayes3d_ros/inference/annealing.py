@@ -8,6 +8,8 @@ did not, a step is shortened by the particles' own weights: consistent, with a b
 (Beskos et al. 2016), where an unbiased estimate would rest on a single particle.
 """
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -15,8 +17,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayes3d_ros.inference.mixture import Modes
 from bayes3d_ros.inference.resampling import effective_fraction
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.scene_graph import Contact
+from bayes3d_ros.model.scene_graph import Contact, shifted
 
+Tree = TypeVar("Tree")
 LEVELS = 6  # of the plan
 MOST_LEVELS = 16
 TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
@@ -26,7 +29,7 @@ _LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no comp
 
 
 def exponents(log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"]) -> Float[Array, "L"]:
-    """Increasing exponents up to 1 (repeated at the end). Each step keeps nearly half of the effective draws:
+    """Increasing exponents up to 1 (repeated at the end). Each step keeps a third of the effective draws:
     draws with these weights from q, log_ratio = log target - log q."""
     log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
 
@@ -40,7 +43,7 @@ def exponents(log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"]) -> Fl
 def longest_step(
     b: Float[Array, ""], most: Float[Array, ""], log_ratio: Float[Array, "N"], log_weight: Float[Array, "N"]
 ) -> Float[Array, ""]:
-    """The largest exponent up to `most` that keeps nearly half of the draws effective that are so now."""
+    """The largest exponent up to `most` that keeps a third of the draws effective that are so now."""
 
     def enough(c: Array) -> Array:
         step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
@@ -75,12 +78,11 @@ def jump(key: PRNGKeyArray, contact: Contact, library: LibraryArrays) -> Contact
     ways = library.alike_face.shape[2]
     way = jax.random.randint(key, contact.type.shape, 0, ways)
     kind, face = jnp.maximum(contact.type, 0), jnp.maximum(contact.face, 0)
-    shift = library.alike_shift[kind, face, way]
-    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
-    return Contact(
-        contact.type,
-        library.alike_face[kind, face, way],
-        contact.x + c * shift[:, 0] - s * shift[:, 1],
-        contact.y + s * shift[:, 0] + c * shift[:, 1],
-        jnp.mod(contact.yaw + shift[:, 2], 2 * jnp.pi),
-    )
+    there = shifted(contact, library.alike_face[kind, face, way], library.alike_shift[kind, face, way])
+    return there._replace(yaw=jnp.mod(there.yaw, 2 * jnp.pi))
+
+
+def metropolis(key: PRNGKeyArray, log_accept: Float[Array, "N"], to: Tree, at: Tree) -> Tree:
+    """For each particle the one moved to, with probability min(1, exp(log_accept)), or the one that it is at."""
+    accept = jnp.log(jax.random.uniform(key, log_accept.shape)) < log_accept  # NaN: neither has weight
+    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)

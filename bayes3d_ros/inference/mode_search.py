@@ -11,7 +11,7 @@ from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes, 
 from bayes3d_ros.inference.resampling import effective_fraction
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.lookalikes import ALIKE
-from bayes3d_ros.model.scene_graph import Contact, Table, log_prior
+from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, shifted
 
 Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
@@ -188,10 +188,8 @@ def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Mo
     face = jnp.concatenate([at.face[:, None], library.alike_face[at.type, at.face]], 1)
     shift = library.alike_shift[at.type, at.face]
     shift = jnp.concatenate([jnp.zeros_like(shift[:, :1]), shift], 1)
-    c, s = jnp.cos(at.yaw)[:, None], jnp.sin(at.yaw)[:, None]
-    dx, dy = c * shift[..., 0] - s * shift[..., 1], s * shift[..., 0] + c * shift[..., 1]
-    kind = jnp.broadcast_to(at.type[:, None], face.shape)
-    centre = Contact(kind, face, at.x[:, None] + dx, at.y[:, None] + dy, at.yaw[:, None] + shift[..., 2])
+    centre = shifted(jax.tree.map(lambda a: jnp.broadcast_to(a[:, None], face.shape), at), face, shift)
+    dx, dy = centre.x - at.x[:, None], centre.y - at.y[:, None]
     # A turn of one carries the middle of the other around.
     zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
     rows = [jnp.stack(row, -1) for row in ((one, zero, -dy), (zero, one, dx), (zero, zero, one))]

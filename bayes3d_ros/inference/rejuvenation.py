@@ -3,8 +3,8 @@
 A population that is resampled stage by stage ends with few ancestors, and an object that was placed before its
 neighbours were known need not fit beside them. Metropolis-Hastings moves it with everything else held: to a fresh draw
 from its own stage's mixture or to where it looks alike, then by a random walk. The target is that of the sampler's
-lists, p_k times the backward kernels of all stages, so weights stay what they are. One object is
-moved, the one of which the fewest placements are left.
+lists, p_k times the backward kernels of all stages, so weights stay what they are. One object is moved, the one of
+which the fewest placements are left.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.inference.annealing import jump, walk
+from bayes3d_ros.inference.annealing import jump, metropolis, walk
 from bayes3d_ros.inference.coarse_to_fine import Context, conflicts
 from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes
 from bayes3d_ros.inference.noise import NoiseGrid, log_marginal
@@ -143,8 +143,7 @@ def _move(
         )
         to = placed(contact, table_without + gain(contact), alone)
         log_accept = to.log_target - now.log_target + jnp.where(fresh, now.log_q - to.log_q, 0.0)
-        accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept
-        return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, now)
+        return metropolis(accept_key, log_accept, to, now)
 
     end = jax.lax.fori_loop(0, _MOVES, step, now)
     objects = jax.tree.map(lambda a, b: a.at[:, m].set(b), state.objects, end.contact)

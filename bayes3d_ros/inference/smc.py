@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
-from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, jump, longest_step, walk
+from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, jump, longest_step, metropolis, walk
 from bayes3d_ros.inference.coarse_to_fine import Context, Scene, conflicts, find_proposal
 from bayes3d_ros.inference.mixture import Modes, Proposal, log_density, propose
 from bayes3d_ros.inference.mode_search import COMPONENTS
@@ -46,7 +46,6 @@ class Info(NamedTuple):
     """What happened in a stage."""
 
     ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
-    best_gain: Float[Array, ""]  # nats over the ancestor
 
 
 class _Extended(NamedTuple):
@@ -119,15 +118,13 @@ def step(
         return _Extended(ancestor, new, summed, log_likelihood, log_q, jnp.where(clash, -jnp.inf, log_ratio))
 
     start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
-    best = (start.log_ratio + start.log_q - log_prior(start.new, library, table)).max()
     end, log_weight, log_evidence, ess = _anneal(
         anneal_key, start, log_weight, exponents, extend, proposal, context, ess_threshold
     )
-    empty = empty_table(context, grid, window)
     own = jax.lax.cond(
         count == 0,
         lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
-        lambda: gain_alone(end.new, empty, context, grid, window),
+        lambda: gain_alone(end.new, empty_table(context, grid, window), context, grid, window),
     )
     alone = state.alone[end.ancestor].at[:, count].set(own)
     log_weight, last = _normalised(log_weight + log_last(alone, count))
@@ -144,7 +141,7 @@ def step(
         log_weight=log_weight,
         log_evidence=state.log_evidence + log_evidence + last,
         modes=modes,
-    ), Info(ess, best)
+    ), Info(ess)
 
 
 @partial(jax.jit, static_argnames="window")
@@ -224,5 +221,4 @@ def _move(
     )
     to = extend(at.ancestor, new)
     log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
-    accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
-    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
+    return metropolis(accept_key, log_accept, to, at)

@@ -19,6 +19,14 @@ class Contact(NamedTuple):
     yaw: Float[Array, "*batch"]
 
 
+def shifted(contact: Contact, face: Int[Array, "*batch"], shift: Float[Array, "*batch 3"]) -> Contact:
+    """On another face, moved by (x, y) along the contact's own axes and turned by yaw."""
+    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
+    x = contact.x + c * shift[..., 0] - s * shift[..., 1]
+    y = contact.y + s * shift[..., 0] + c * shift[..., 1]
+    return Contact(contact.type, face, x, y, contact.yaw + shift[..., 2])
+
+
 class Table(NamedTuple):
     """The table's plane is z = 0 of its frame; the prior area is a rectangle about its origin."""
 
