@@ -77,17 +77,12 @@ def evidence_left(scene_depth: Float[Array, "H W"], image: Image, noise: Noise) 
 
 def conflicts(contact: Contact, others: Contact, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
     """Whether an object interpenetrates any of the first `count` others; contact [N], others [N, M]."""
-    slots = others.type.shape[1]
-    worst = jnp.zeros(contact.type.shape)
-    for m in range(slots):
-        other = jax.tree.map(lambda a, m=m: a[:, m], others)
-        share = jax.lax.cond(
-            jnp.any(m < count),
-            lambda other=other: overlap(contact, other, library),
-            lambda: jnp.zeros(contact.type.shape),
-        )
-        worst = jnp.maximum(worst, jnp.where(m < count, share, 0.0))
-    return worst > limit
+
+    def with_other(m: Int[Array, ""], worst: Float[Array, "N"]) -> Float[Array, "N"]:
+        share = overlap(contact, jax.tree.map(lambda a: a[:, m], others), library)
+        return jnp.maximum(worst, jnp.where(m < count, share, 0.0))
+
+    return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(contact.type.shape)) > limit
 
 
 def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:

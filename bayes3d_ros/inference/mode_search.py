@@ -177,7 +177,9 @@ def adapt(
         trial, modes, _, _ = state
         return trial + 1, *pilot(jax.random.fold_in(key, trial), modes)
 
-    _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (1, *pilot(jax.random.fold_in(key, 0), modes)))
+    unknown = jnp.zeros(PILOT_DRAWS)
+    none_yet = Pilots(draw_modes(key, modes, PILOT_DRAWS), unknown, unknown)
+    _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (0, modes, none_yet, jnp.float32(0.0)))
     return modes, pilots
 
 

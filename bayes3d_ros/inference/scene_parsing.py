@@ -62,16 +62,18 @@ class SceneParser:
         self._cast = jax.jit(renderers["march"])
 
     def warm_up(self, width: int, height: int) -> None:
-        """Compile for images of this size (values of the intrinsics do not matter) by parsing a made-up frame: a table
-        seen by a camera 0.8 m above it, with something on it."""
+        """Compile for images of this size (values of the intrinsics do not matter) by parsing a made-up frame: a bare
+        table seen by a camera 0.8 m above it, which takes no search."""
         intrinsics = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
         above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
         T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
         depth = above / np.maximum(intrinsics.rays()[..., 1] * c + s, 0.2)
-        v, u, size = height // 2, width // 2, max(width // 16, 1)
-        depth[v - size : v + size, u - size : u + size] *= 0.9
+        frame = DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera)
         with contextlib.suppress(ParseError):  # unusual settings may leave nothing of the frame
-            self.parse(DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera))
+            self.parse(frame)
+            image, table, *_ = self._observe(frame)
+            context = Context(image, self._arrays, table)
+            self._refreshed(_frame_key(0, 0), self._empty(context), self.settings.max_objects, context)
         rays = jnp.zeros((height, width))
         self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
 
@@ -158,7 +160,7 @@ class SceneParser:
         settings = self.settings
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
-        state = smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
+        state = self._empty(context)
         stages: list[_Stage] = []
         ess, log_mass = [], [0.0]
         for count in range(last):
@@ -189,6 +191,10 @@ class SceneParser:
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
             stages = stages[-1:]
         return stages, ess
+
+    def _empty(self, context: Context) -> smc.State:
+        settings = self.settings
+        return smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
 
     def _refreshed(self, key: PRNGKeyArray, state: smc.State, count: int, context: Context) -> smc.State:
         """The likeliest number of objects, with one of them moved; a single object was moved when it was added."""

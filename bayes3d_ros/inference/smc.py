@@ -19,7 +19,7 @@ from bayes3d_ros.inference.coarse_to_fine import Context, Scene, conflicts, find
 from bayes3d_ros.inference.mixture import Modes, Proposal, log_density, propose
 from bayes3d_ros.inference.mode_search import COMPONENTS
 from bayes3d_ros.inference.noise import NoiseGrid
-from bayes3d_ros.inference.ordering import empty_table, gain_alone, log_last
+from bayes3d_ros.inference.ordering import Empty, empty_table, gain_alone, log_last
 from bayes3d_ros.inference.rejuvenation import Scenes, rejuvenate
 from bayes3d_ros.inference.resampling import effective_fraction, systematic
 from bayes3d_ros.model.scene_graph import Contact, log_prior
@@ -40,6 +40,7 @@ class State(NamedTuple):
     log_weight: Float[Array, "N"]  # normalised
     log_evidence: Float[Array, ""]  # of k objects, relative to the empty table
     modes: Modes  # [M, C], of the proposal of each stage
+    empty: Empty  # the table without any
 
 
 class Info(NamedTuple):
@@ -83,6 +84,7 @@ def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, wi
             jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
             jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
         ),
+        empty=empty,
     )
 
 
@@ -124,7 +126,7 @@ def step(
     own = jax.lax.cond(
         count == 0,
         lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
-        lambda: gain_alone(end.new, empty_table(context, grid, window), context, grid, window),
+        lambda: gain_alone(end.new, state.empty, context, grid, window),
     )
     alone = state.alone[end.ancestor].at[:, count].set(own)
     log_weight, last = _normalised(log_weight + log_last(alone, count))
@@ -141,6 +143,7 @@ def step(
         log_weight=log_weight,
         log_evidence=state.log_evidence + log_evidence + last,
         modes=modes,
+        empty=state.empty,
     ), Info(ess)
 
 
@@ -149,10 +152,9 @@ def refresh(
     key: PRNGKeyArray, state: State, count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
 ) -> State:
     """The same posterior of scenes of `count` objects, that object moved of which the fewest placements are left."""
-    empty = empty_table(context, grid, window)
     scenes = Scenes(state.objects, state.alone, state.scenes, state.table, state.log_likelihood)
     moved = rejuvenate(
-        key, scenes, state.log_weight, state.modes, count, empty, context, grid, window, OVERLAP_LIMIT
+        key, scenes, state.log_weight, state.modes, count, state.empty, context, grid, window, OVERLAP_LIMIT
     )
     return state._replace(**moved._asdict())
 

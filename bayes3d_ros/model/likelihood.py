@@ -97,16 +97,16 @@ def inlier_density(
     nearest = across[0]
     for d in across[1:]:
         nearest = jnp.minimum(nearest, d)
-    density = []
-    for s in range(sigma.shape[0]):
-        scale = -0.5 / sigma[s] ** 2
-        both = weight = jnp.zeros_like(norm2)
-        for d, q in zip(across, along, strict=True):
-            w = jnp.exp(scale * (d - nearest)) + jnp.where(d < _FAR_AWAY, lateral, 0.0)
-            both += w * jnp.exp(scale * q)
-            weight += w
-        density.append(both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma[s]))
-    return jnp.where(nearest < _FAR_AWAY, jnp.stack(density), outlier_density(pixels))
+    # All sigmas in one expression of the window: a copy of it for each would be slower, and slow to compile.
+    sigma = sigma[:, None, None, None]
+    scale = -0.5 / sigma**2
+    both = weight = jnp.zeros((len(sigma), *norm2.shape))
+    for d, q in zip(across, along, strict=True):
+        w = jnp.exp(scale * (d - nearest)) + jnp.where(d < _FAR_AWAY, lateral, 0.0)
+        both += w * jnp.exp(scale * q)
+        weight += w
+    density = both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma)
+    return jnp.where(nearest < _FAR_AWAY, density, outlier_density(pixels))
 
 
 def point_density(
@@ -131,11 +131,9 @@ def point_density(
     per_pixel = z * z * pixels.step_x * pixels.step_y / (2 * jnp.pi) ** 1.5
     nothing = ~jnp.isfinite(rendered[half : half + height, half : half + width])
     background = jnp.where(nothing, outlier_density(pixels), 0.0)
-    density = []
-    for s in range(sigma.shape[0]):
-        total = sum(jnp.exp(-0.5 / sigma[s] ** 2 * d) for d in apart2)
-        density.append(per_pixel / sigma[s] ** 3 * total + background)
-    return jnp.stack(density)
+    sigma = sigma[:, None, None, None]
+    total = sum(jnp.exp(-0.5 / sigma**2 * d) for d in apart2)
+    return per_pixel / sigma**3 * total + background
 
 
 def outlier_density(pixels: Pixels) -> Float[Array, "h w T"]:

@@ -48,9 +48,9 @@ def lookalikes(
     found = Lookalikes(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
     turn = np.arange(_TURNS) * 2 * np.pi / _TURNS
     c, s = np.cos(turn), np.sin(turn)
+    best: list[list[tuple[float, int, np.ndarray]]] = [[] for _ in range(faces)]
     for face, T in enumerate(T_contact_object):
-        best: list[tuple[float, int, np.ndarray]] = []
-        for other in [f for f in range(faces) if abs(extent[f] - extent[face]) < 2 * _ALIKE_WITHIN]:
+        for other in [f for f in range(face, faces) if abs(extent[f] - extent[face]) < 2 * _ALIKE_WITHIN]:
             x, y = middle[other]
             turned = np.stack([c * x - s * y, s * x + c * y], 1)
             shift = np.concatenate([middle[face] - turned, turn[:, None]], 1)
@@ -59,16 +59,20 @@ def lookalikes(
             shift, error = shift[lowest], error[lowest]
             for halving in range(_ROUNDS if len(shift) else 0):
                 step = np.array([0, 0, np.pi / _TURNS / 2**halving])
-                tried = [_slid(shift + sign * step, resting[other], T, surface) for sign in (-1, 0, 1)]
-                errors = np.stack([e for _, e in tried])
-                pick = errors.argmin(0)
-                shift = np.stack([a for a, _ in tried])[pick, np.arange(len(shift))]
-                error = errors.min(0)
+                tried = np.concatenate([shift - step, shift, shift + step])
+                tried, errors = (a.reshape(3, len(shift), -1) for a in _slid(tried, resting[other], T, surface))
+                pick = errors[..., 0].argmin(0), np.arange(len(shift))
+                shift, error = tried[pick], errors[..., 0][pick]
             for _ in range(_SLIDES if len(shift) else 0):
                 shift, error = _slid(shift, resting[other], T, surface)
-            best += [(e, other, row) for e, row in zip(error, shift, strict=True) if e < _ALIKE_WITHIN]
+            for e, row in zip(error, shift, strict=True):
+                if e < _ALIKE_WITHIN:
+                    best[face].append((e, other, row))
+                    if other != face:
+                        best[other].append((e, face, _inverse(row)))
+    for face in range(faces):
         chosen: list[tuple[int, np.ndarray]] = [(face, np.zeros(3))]  # itself needs no place
-        for _, other, row in sorted(best, key=lambda b: b[0]):
+        for _, other, row in sorted(best[face], key=lambda b: b[0]):
             if all(other != f or abs(_wrapped(row[2] - r[2])) > _SAME_TURN for f, r in chosen) and len(chosen) <= ALIKE:
                 chosen.append((other, row))
         for place, (other, row) in enumerate(chosen[1:]):
