@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.alignment import align
 from bayes3d_ros.inference.annealing import LEVELS, exponents
+from bayes3d_ros.inference.consensus import MANY_OUTLIERS, consensus
 from bayes3d_ros.inference.mixture import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, log_density, wrap
 from bayes3d_ros.inference.mode_search import (
     FINALISTS,
@@ -67,12 +68,14 @@ class Context(NamedTuple):
 def evidence_left(scene_depth: Float[Array, "H W"], image: Image, noise: Noise) -> Evidence:
     """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
     explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
-    an outlier whatever is added, and no witness."""
-    in_front = scene_depth - image.depth
-    apart = in_front / (3 * noise.sigma[0] + 0.003 * image.depth)
+    an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
+    many = noise.p_outlier[0] > MANY_OUTLIERS
+    depth, kind = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.kind)
+    in_front = scene_depth - depth
+    apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
     unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)
-    inside = image.kind == IN_WORKSPACE
-    return Evidence(image.depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
+    inside = kind == IN_WORKSPACE
+    return Evidence(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
 
 
 def conflicts(contact: Contact, others: Contact, count: Int[Array, "*n"], library: LibraryArrays, limit: float):

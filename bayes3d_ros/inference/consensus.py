@@ -1,0 +1,36 @@
+"""Depth that neighbours agree on: where most returns are outliers, a few points of a sketch seldom meet a good one."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+MANY_OUTLIERS = 0.3  # share of the returns above which the search looks at consensus
+_REACH = 2  # pixels
+_WITHIN = 0.02  # of the depth: returns of one surface
+_FEWEST = 3  # returns that make a surface
+
+
+def consensus(
+    depth: Float[Array, "H W"], kind: Int[Array, "H W"]
+) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
+    """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
+    where fewer than three agree."""
+    height, width = depth.shape
+    size = 2 * _REACH + 1
+
+    def about(a: Array) -> Array:
+        padded = jnp.pad(a, _REACH)
+        return jnp.stack([padded[v : v + height, u : u + width] for v in range(size) for u in range(size)])
+
+    depths, kinds = about(depth), about(kind)
+
+    def better(j: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        chosen, most = best
+        agree = ((jnp.abs(depths - depths[j]) < _WITHIN * depths[j]) & (depths > 0)).sum(0)
+        return jnp.where(agree > most, j, chosen), jnp.maximum(agree, most)
+
+    # The pixel's own return comes first: it stays where no other has more support.
+    own = jnp.full(depth.shape, len(depths) // 2)
+    chosen, most = jax.lax.fori_loop(0, len(depths), better, better(own[0, 0], (own, jnp.zeros_like(own))))
+    depth, kind = (jnp.take_along_axis(a, chosen[None], 0)[0] for a in (depths, kinds))
+    return jnp.where(most >= _FEWEST, depth, 0.0), kind
