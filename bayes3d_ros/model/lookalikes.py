@@ -17,6 +17,8 @@ _SLIDES = 3  # at the end
 _ALIKE_WITHIN = 0.006  # metres, root mean square between the surfaces
 _FAR = 0.02  # metres: farther is no worse
 _HALF_TURN = 0.1  # radians off one
+_SQUARE_WITHIN = 0.1  # of the entries of a rotation, off quarter turns
+_AS_GOOD = 1e-4  # metres that those may lie farther off than the best turn found
 _SAME_TURN = 0.35  # radians: closer poses on one face are one mode
 
 
@@ -42,6 +44,7 @@ def lookalikes(
     some = points[np.linspace(0, len(points) - 1, min(_POINTS, len(points))).astype(int)]
     resting = [some @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
     whole = [points @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
+    centre = 0.5 * (points.max(0) + points.min(0))
     extent = np.array([np.ptp(w[:, 2]) for w in whole])
     middle = np.array([0.5 * (w.max(0) + w.min(0))[:2] for w in whole])
     faces = len(T_contact_object)
@@ -65,6 +68,9 @@ def lookalikes(
                 shift, error = tried[pick], errors[..., 0][pick]
             for _ in range(_SLIDES if len(shift) else 0):
                 shift, error = _slid(shift, resting[other], T, surface)
+            square = _squared(shift, T, T_contact_object[other], centre)
+            squared = _slid(square, resting[other], T, surface)[1] if len(shift) else error
+            shift = np.where((squared < error + _AS_GOOD)[:, None], square, shift)
             for e, row in zip(error, shift, strict=True):
                 if e < _ALIKE_WITHIN:
                     best[face].append((e, other, row))
@@ -97,8 +103,9 @@ def _reversible(found: Lookalikes) -> Lookalikes:
             other, shift = int(found.face[face, place]), found.shift[face, place]
             if other == face and not shift.any():
                 continue
-            known = zip(paired.face[face], paired.shift[face], strict=True)
-            if any(other == f and s.any() and abs(_wrapped(shift[2] - s[2])) < _SAME_TURN for f, s in known):
+            placed = ALIKE - room[face]
+            known = zip(paired.face[face, :placed], paired.shift[face, :placed], strict=True)
+            if any(other == f and abs(_wrapped(shift[2] - s[2])) < _SAME_TURN for f, s in known):
                 continue
             own = other == face and abs(_wrapped(shift[2] - np.pi)) < _HALF_TURN  # a half turn is its own way back
             shift = np.array([*shift[:2], np.pi]) if own else shift
@@ -108,6 +115,29 @@ def _reversible(found: Lookalikes) -> Lookalikes:
                 if not own:
                     add(other, face, back)
     return paired
+
+
+def _squared(
+    shift: Float[np.ndarray, "T 3"],
+    T_contact_object: Float[np.ndarray, "4 4"],
+    T_contact_other: Float[np.ndarray, "4 4"],
+    centre: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "T 3"]:
+    """With the object turned by quarter turns about its own axes, if it nearly is: a posterior is finer than a fit, and
+    what is symmetric in its voxels is so exactly."""
+    squared = shift.copy()
+    for k, (x, y, yaw) in enumerate(shift):
+        c, s = np.cos(yaw), np.sin(yaw)
+        slide = np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]])
+        turn = (np.linalg.inv(T_contact_object) @ slide @ T_contact_other)[:3, :3]
+        square = np.round(turn)
+        if np.abs(turn - square).max() > _SQUARE_WITHIN or np.linalg.det(square) != 1:
+            continue
+        about = np.eye(4)
+        about[:3, :3], about[:3, 3] = square, centre - square @ centre
+        slide = T_contact_object @ about @ np.linalg.inv(T_contact_other)
+        squared[k] = *slide[:2, 3], np.arctan2(slide[1, 0], slide[0, 0]) % (2 * np.pi)
+    return squared
 
 
 def _inverse(shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
