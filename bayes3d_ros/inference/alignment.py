@@ -37,8 +37,9 @@ def align(
         q = observed[..., None] * jnp.stack([image.ray_x[u], image.ray_y[v], jnp.ones_like(observed)], -1)
         residual = (n * (q - p)).sum(-1)
         gap = jnp.abs(observed - z)
-        slant = jnp.abs((n * p).sum(-1)) / jnp.linalg.norm(p, axis=-1)
-        weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & (slant > 0.15), 1.0, 0.0)
+        # What faces away is not what returned, near as it may lie: a wall is thinner than the tolerance.
+        facing = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
+        weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & (facing > 0.15), 1.0, 0.0)
         weight = weight * evidence.unexplained[v, u] / (1 + (residual / tolerance) ** 2) ** 2
         centre = contact.x[:, None] * axes[0] + contact.y[:, None] * axes[1] + t_table
         turn = jnp.cross(axes[2], p - centre[:, None])

@@ -39,12 +39,13 @@ from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
 from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
 
-_GLOBAL, _QUARTERS, _CANDIDATES = 64, 4, 32
+_GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
 _MODES = 8
 _FIT = (24, 3)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _BEHIND = 1e6  # nats
+_WIDE = 120  # pixels across: the search sees smaller images whole, wider ones at half their resolution
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
@@ -115,17 +116,21 @@ def candidates(
     scores = score_cells(centres, count, evidence, image, library, table)
     kinds = scores.shape[1]
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
-    # score flat in yaw); and the best of every type and face: no type is shut out by a crowd of another.
+    # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
+    # another.
     _, index = jax.lax.top_k(scores.max(-1).ravel(), _GLOBAL)
-    per_face = scores.transpose(1, 2, 0, 3).reshape(kinds * NUM_FACES, -1)
+    half = YAWS // _HALVES
+    per_face = scores.reshape(-1, kinds, NUM_FACES, _HALVES, half).transpose(1, 2, 3, 0, 4)
+    per_face = per_face.reshape(kinds * NUM_FACES * _HALVES, -1)
     cell, kind, face = index // (kinds * NUM_FACES), index // NUM_FACES % kinds, index % NUM_FACES
     quarter = jnp.argmax(scores[cell, kind, face].reshape(_GLOBAL, _QUARTERS, -1), -1)
     quarter = quarter + jnp.arange(_QUARTERS) * (YAWS // _QUARTERS)
     first = jnp.argmax(per_face, 1)
-    yaw = jnp.concatenate([quarter.ravel(), first % YAWS])
-    cell = jnp.concatenate([jnp.repeat(cell, _QUARTERS), first // YAWS])
-    kind = jnp.concatenate([jnp.repeat(kind, _QUARTERS), jnp.repeat(jnp.arange(kinds), NUM_FACES)])
-    face = jnp.concatenate([jnp.repeat(face, _QUARTERS), jnp.tile(jnp.arange(NUM_FACES), kinds)])
+    each_kind, each_face, each_half = (a.ravel() for a in jnp.indices((kinds, NUM_FACES, _HALVES)))
+    yaw = jnp.concatenate([quarter.ravel(), each_half * half + first % half])
+    cell = jnp.concatenate([jnp.repeat(cell, _QUARTERS), first // half])
+    kind = jnp.concatenate([jnp.repeat(kind, _QUARTERS), each_kind])
+    face = jnp.concatenate([jnp.repeat(face, _QUARTERS), each_face])
     coarse = scores[cell, kind, face, yaw]
     contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
     contact, information = align(contact, evidence, image, library, table)
@@ -168,11 +173,12 @@ def find_proposal(
     evidence = evidence_left(depth, image, noise)
     found, score = candidates(scene, evidence, context, shape, overlap_limit)
 
-    small = Context(halved(image), library, table)
-    small_depth = pad_scene(depth[::2, ::2], window)
+    fewer = 2 if width >= _WIDE else 1
+    small = Context(halved(image) if fewer == 2 else image, library, table)
+    small_depth = pad_scene(depth[::fewer, ::fewer], window)
 
     def rough(contact: Contact) -> Float[Array, "N"]:
-        return 4 * _gains(contact, small_depth, small, noise, window)
+        return fewer**2 * _gains(contact, small_depth, small, noise, window)
 
     def table_with(contact: Contact) -> Float[Array, "S P"]:
         """The scene's once the first of these objects explains what it does."""
