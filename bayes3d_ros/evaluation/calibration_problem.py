@@ -18,6 +18,7 @@ from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Likelihood
@@ -27,10 +28,20 @@ from bayes3d_ros.model.scene_graph import Contact, Table
 from bayes3d_ros.model.scene_score import Image, draw_objects, log_likelihood_scene, pad_scene
 
 CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
+NEGLIGIBLE = 10.0  # nats: scenes of so much less weight are left as they are
 DISTANCE, TILT = 0.6, np.pi / 4  # of the camera from the table's middle in metres, and of its view below the horizon
 VOXEL = 0.005
 SETTINGS = ParserSettings(
-    max_objects=2, count_ratio=1.0, table_width=0.3, table_depth=0.3, near=0.2, far=1.0, sigma_max=0.004, particles=192
+    max_objects=2,
+    count_ratio=1.0,
+    table_width=0.3,
+    table_depth=0.3,
+    near=0.2,
+    far=1.0,
+    sigma_max=0.004,
+    particles=192,
+    rejuvenation=2,
+    reheating=3,
 )
 
 
@@ -148,8 +159,10 @@ _sample_noise = jax.jit(noise_model.sample)
 def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
     """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
     settings, context = problem.settings, Context(image, problem.library, problem.table)
-    state = smc.init(context, problem.grid, settings.particles, settings.max_objects, settings.window)
-    stages, ess = [], []
+    state = smc.init(
+        context, problem.grid, settings.particles, settings.max_objects, _table_size(settings), settings.window
+    )
+    stages, ess, log_mass = [], [], []
     for number in range(settings.max_objects + 1):
         if number:
             state, info = smc.step(
@@ -163,9 +176,19 @@ def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
                 settings.ess_threshold,
             )
             ess.append(float(info.ess))
-        if number > 1:
+        log_mass.append(float(state.log_evidence) + problem.log_count[number])
+        if number and log_mass[-1] > max(log_mass) - NEGLIGIBLE:
             refresh_key = jax.random.fold_in(key, 2000 + number)
-            state = smc.refresh(refresh_key, state, jnp.int32(number), context, problem.grid, settings.window)
+            state = smc.refresh(
+                refresh_key,
+                state,
+                jnp.int32(number),
+                context,
+                problem.grid,
+                settings.window,
+                settings.ess_threshold,
+                Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating)),
+            )
         noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, problem.grid)
         log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
         stages.append(

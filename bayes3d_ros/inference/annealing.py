@@ -8,18 +8,19 @@ did not, a step is shortened by the particles' own weights: consistent, with a b
 (Beskos et al. 2016), where an unbiased estimate would rest on a single particle.
 """
 
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.inference.mixture import Modes
+from bayes3d_ros.inference.mixture import Modes, Proposal, propose
 from bayes3d_ros.inference.resampling import effective_fraction
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.scene_graph import Contact, shifted
+from bayes3d_ros.model.scene_graph import Contact, Table, shifted
 
-Tree = TypeVar("Tree")
+Tree = TypeVar("Tree", bound=Any)
 LEVELS = 6  # of the plan
 MOST_LEVELS = 16
 TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
@@ -86,3 +87,40 @@ def metropolis(key: PRNGKeyArray, log_accept: Float[Array, "N"], to: Tree, at: T
     """For each particle the one moved to, with probability min(1, exp(log_accept)), or the one that it is at."""
     accept = jnp.log(jax.random.uniform(key, log_accept.shape)) < log_accept  # NaN: neither has weight
     return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
+
+
+class Extended(NamedTuple):
+    """N scenes, each an ancestor with one more object."""
+
+    ancestor: Int[Array, "N"]
+    new: Contact  # [N]
+    table: Float[Array, "N S P"]
+    log_likelihood: Float[Array, "N"]
+    log_q: Float[Array, "N"]  # of the new object
+    log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
+
+
+def move_new(
+    key: PRNGKeyArray,
+    at: Tree,
+    b: Float[Array, ""],
+    kind: Int[Array, ""],
+    extend: Callable[[Int[Array, "N"], Contact], Tree],
+    proposal: Proposal,
+    library: LibraryArrays,
+    table: Table,
+) -> Tree:
+    """Metropolis-Hastings of the new object under q^(1-b) target^b; at holds what `Extended` does. `kind`: 0 a jump to
+    where it looks alike, 1 a walk, 2 a fresh draw from q."""
+    draw_key, accept_key = jax.random.split(key)
+    new = jax.lax.switch(
+        kind,
+        (
+            lambda: jump(draw_key, at.new, library),
+            lambda: walk(draw_key, at.new, proposal.modes),
+            lambda: propose(draw_key, proposal, at.ancestor.shape[0], library, table),
+        ),
+    )
+    to = extend(at.ancestor, new)
+    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
+    return metropolis(accept_key, log_accept, to, at)

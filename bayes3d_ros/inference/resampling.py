@@ -1,8 +1,12 @@
 """Resampling of weighted particles."""
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+Tree = TypeVar("Tree")
 
 
 def systematic(key: PRNGKeyArray, log_weight: Float[Array, "N"], count: int) -> Int[Array, "count"]:
@@ -17,3 +21,22 @@ def effective_fraction(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     total = jax.nn.logsumexp(log_weight)
     ess = jnp.exp(2 * total - jax.nn.logsumexp(2 * log_weight))
     return jnp.where(jnp.isfinite(total), ess / log_weight.shape[0], 0.0)
+
+
+def resample(
+    key: PRNGKeyArray, tree: Tree, log_weight: Float[Array, "N"], threshold: float
+) -> tuple[Tree, Float[Array, "N"]]:
+    """The particles, or where their weights are uneven others drawn from them with equal weights."""
+    few = effective_fraction(log_weight) < threshold
+    particles = len(log_weight)
+    kept = jnp.where(few, systematic(key, log_weight, particles), jnp.arange(particles))
+    return jax.tree.map(lambda a: a[kept], tree), jnp.where(few, -jnp.log(particles), log_weight)
+
+
+def normalised(log_weight: Float[Array, "N"]) -> tuple[Float[Array, "N"], Float[Array, ""]]:
+    """Log weights that sum to one, and the log of their sum; equal ones where all are zero."""
+    best = jnp.max(log_weight)
+    log_weight = log_weight - jnp.where(jnp.isfinite(best), best, 0.0)  # thousands of nats cost float32 four digits
+    total = jax.nn.logsumexp(log_weight)
+    equal = -jnp.log(log_weight.shape[0])
+    return jnp.where(jnp.isfinite(total), log_weight - total, equal), best + total

@@ -15,6 +15,7 @@ from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_table_errors
+from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
 from bayes3d_ros.model.library_arrays import library_arrays
@@ -194,14 +195,20 @@ class SceneParser:
 
     def _empty(self, context: Context) -> smc.State:
         settings = self.settings
-        return smc.init(context, self._grid, settings.particles, max(settings.max_objects, 1), settings.window)
+        slots = max(settings.max_objects, 1)
+        return smc.init(context, self._grid, settings.particles, slots, self._table_size, settings.window)
 
     def _refreshed(self, key: PRNGKeyArray, state: smc.State, count: int, context: Context) -> smc.State:
-        """The likeliest number of objects, with one of them moved; a single object was moved when it was added."""
-        if count < 2:
+        """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
+        reheating."""
+        settings = self.settings
+        if count < 2 and not (count and settings.reheating):
             return state
         key = jax.random.fold_in(key, 2000 + count)
-        return smc.refresh(key, state, jnp.int32(count), context, self._grid, self.settings.window)
+        effort = Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating))
+        return smc.refresh(
+            key, state, jnp.int32(count), context, self._grid, settings.window, settings.ess_threshold, effort
+        )
 
     def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context, matters: bool = True) -> _Stage:
         """A stage's scenes; only its evidence where they do not matter."""

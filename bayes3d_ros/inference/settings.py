@@ -75,6 +75,12 @@ class ParserSettings:
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.3, "resample below this fraction of effective particles", low=0.0, high=1.0)
+    rejuvenation: int = setting(
+        1, "objects of a finished scene that are moved again given the others", low=0, high=100
+    )
+    reheating: int = setting(
+        0, "steps by which their posterior is flattened meanwhile, to get from peak to peak", low=0, high=20
+    )
     seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
 
     def __post_init__(self) -> None:

@@ -14,14 +14,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
-from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, jump, longest_step, metropolis, walk
+from bayes3d_ros.inference.annealing import MOST_LEVELS, TOO_UNEVEN, Extended, longest_step, move_new
 from bayes3d_ros.inference.coarse_to_fine import Context, Scene, conflicts, find_proposal
-from bayes3d_ros.inference.mixture import Modes, Proposal, log_density, propose
+from bayes3d_ros.inference.mixture import SHARES, Modes, Proposal, log_density, propose
 from bayes3d_ros.inference.mode_search import COMPONENTS
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.ordering import Empty, empty_table, gain_alone, log_last
-from bayes3d_ros.inference.rejuvenation import Scenes, rejuvenate
-from bayes3d_ros.inference.resampling import effective_fraction, systematic
+from bayes3d_ros.inference.rejuvenation import Effort, Frame, Scenes, rejuvenate
+from bayes3d_ros.inference.resampling import effective_fraction, normalised, resample
+from bayes3d_ros.inference.sketch_search import cell_grid
 from bayes3d_ros.model.scene_graph import Contact, log_prior
 from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain
 
@@ -39,7 +40,7 @@ class State(NamedTuple):
     log_likelihood: Float[Array, "N"]  # noise integrated out
     log_weight: Float[Array, "N"]  # normalised
     log_evidence: Float[Array, ""]  # of k objects, relative to the empty table
-    modes: Modes  # [M, C], of the proposal of each stage
+    proposals: Proposal  # [M], of each stage
     empty: Empty  # the table without any
 
 
@@ -49,19 +50,10 @@ class Info(NamedTuple):
     ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
 
 
-class _Extended(NamedTuple):
-    """N scenes, each an ancestor with one more object."""
-
-    ancestor: Int[Array, "N"]
-    new: Contact  # [N]
-    table: Float[Array, "N S P"]
-    log_likelihood: Float[Array, "N"]
-    log_q: Float[Array, "N"]  # of the new object
-    log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
-
-
-@partial(jax.jit, static_argnames=("particles", "max_objects", "window"))
-def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, window: int) -> State:
+@partial(jax.jit, static_argnames=("particles", "max_objects", "table_size", "window"))
+def init(
+    context: Context, grid: NoiseGrid, particles: int, max_objects: int, table_size: tuple[float, float], window: int
+) -> State:
     """The empty table."""
     empty = empty_table(context, grid, window)
     slots = (particles, max_objects)
@@ -79,10 +71,14 @@ def init(context: Context, grid: NoiseGrid, particles: int, max_objects: int, wi
         log_likelihood=everywhere(empty.log_likelihood),
         log_weight=jnp.full(particles, -jnp.log(particles), jnp.float32),
         log_evidence=jnp.float32(0.0),
-        modes=Modes(
-            Contact(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
-            jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
-            jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
+        proposals=Proposal(
+            Modes(
+                Contact(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
+                jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
+                jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
+            ),
+            jnp.zeros((max_objects, *cell_grid(table_size))),
+            jnp.zeros((max_objects, len(SHARES))),
         ),
         empty=empty,
     )
@@ -103,13 +99,13 @@ def step(
     image, library, table = context
     particles = state.log_weight.shape[0]
     resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
-    ancestor, log_weight = _resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
+    ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
     scene = Scene(state.scenes[lead], state.table[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
     proposal, exponents = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
 
-    def extend(ancestor: Int[Array, "N"], new: Contact) -> _Extended:
+    def extend(ancestor: Int[Array, "N"], new: Contact) -> Extended:
         gain = log_likelihood_gain(new, ancestor, state.scenes, *context, grid.coarse, window)
         summed = state.table[ancestor] + gain
         log_likelihood = noise_model.log_marginal(summed, grid)
@@ -117,7 +113,7 @@ def step(
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
-        return _Extended(ancestor, new, summed, log_likelihood, log_q, jnp.where(clash, -jnp.inf, log_ratio))
+        return Extended(ancestor, new, summed, log_likelihood, log_q, jnp.where(clash, -jnp.inf, log_ratio))
 
     start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
     end, log_weight, log_evidence, ess = _anneal(
@@ -129,11 +125,11 @@ def step(
         lambda: gain_alone(end.new, state.empty, context, grid, window),
     )
     alone = state.alone[end.ancestor].at[:, count].set(own)
-    log_weight, last = _normalised(log_weight + log_last(alone, count))
+    log_weight, last = normalised(log_weight + log_last(alone, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
     scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
-    modes = jax.tree.map(lambda a, b: a.at[count].set(b), state.modes, proposal.modes)
+    proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
     return State(
         objects=objects,
         alone=alone,
@@ -142,38 +138,26 @@ def step(
         log_likelihood=end.log_likelihood,
         log_weight=log_weight,
         log_evidence=state.log_evidence + log_evidence + last,
-        modes=modes,
+        proposals=proposals,
         empty=state.empty,
     ), Info(ess)
 
 
-@partial(jax.jit, static_argnames="window")
+@partial(jax.jit, static_argnames=("window", "ess_threshold"))
 def refresh(
-    key: PRNGKeyArray, state: State, count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
+    key: PRNGKeyArray,
+    state: State,
+    count: Int[Array, ""],
+    context: Context,
+    grid: NoiseGrid,
+    window: int,
+    ess_threshold: float,
+    effort: Effort,
 ) -> State:
-    """The same posterior of scenes of `count` objects, that object moved of which the fewest placements are left."""
-    scenes = Scenes(state.objects, state.alone, state.scenes, state.table, state.log_likelihood)
-    moved = rejuvenate(
-        key, scenes, state.log_weight, state.modes, count, state.empty, context, grid, window, OVERLAP_LIMIT
-    )
-    return state._replace(**moved._asdict())
-
-
-def _resample(key, tree, log_weight, threshold):
-    """The particles, or where their weights are uneven others drawn from them with equal weights."""
-    few = effective_fraction(log_weight) < threshold
-    particles = len(log_weight)
-    kept = jnp.where(few, systematic(key, log_weight, particles), jnp.arange(particles))
-    return jax.tree.map(lambda a: a[kept], tree), jnp.where(few, -jnp.log(particles), log_weight)
-
-
-def _normalised(log_weight: Float[Array, "N"]) -> tuple[Float[Array, "N"], Float[Array, ""]]:
-    """Log weights that sum to one, and the log of their sum; equal ones where all are zero."""
-    best = jnp.max(log_weight)
-    log_weight = log_weight - jnp.where(jnp.isfinite(best), best, 0.0)  # thousands of nats cost float32 four digits
-    total = jax.nn.logsumexp(log_weight)
-    equal = -jnp.log(log_weight.shape[0])
-    return jnp.where(jnp.isfinite(total), log_weight - total, equal), best + total
+    """The same posterior of scenes of `count` objects, some of them moved."""
+    scenes = Scenes(state.objects, state.alone, state.scenes, state.table, state.log_likelihood, state.log_weight)
+    frame = Frame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
+    return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 
 def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_threshold):
@@ -188,15 +172,15 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
         planned = effective_fraction(log_weight + (c - b) * extended.log_ratio)
         shorter = longest_step(b, c, extended.log_ratio, log_weight)
         c = jnp.where((planned < TOO_UNEVEN) & (level < MOST_LEVELS - 1), shorter, c)
-        log_weight, gained = _normalised(log_weight + (c - b) * extended.log_ratio)
+        log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
         now = effective_fraction(log_weight)
         few = now < ess_threshold
         level_key = jax.random.fold_in(key, level)
-        extended, log_weight = _resample(jax.random.fold_in(level_key, _MOVES), extended, log_weight, ess_threshold)
+        extended, log_weight = resample(jax.random.fold_in(level_key, _MOVES), extended, log_weight, ess_threshold)
 
-        def move(number: Array, extended: _Extended) -> _Extended:
-            move_key = jax.random.fold_in(level_key, number)
-            return _move(move_key, extended, c, (level + number) % 3, extend, proposal, context)
+        def move(number: Array, extended: Extended) -> Extended:
+            move_key, kind = jax.random.fold_in(level_key, number), (level + number) % 3
+            return move_new(move_key, extended, c, kind, extend, proposal, context.library, context.table)
 
         moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
         extended = jax.lax.fori_loop(0, moves, move, extended)
@@ -205,22 +189,3 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
     first = (jnp.int32(0), jnp.float32(0.0), start, log_weight, jnp.float32(0.0), jnp.float32(1.0))
     _, _, end, log_weight, log_evidence, ess = jax.lax.while_loop(going, step, first)
     return end, log_weight, log_evidence, ess
-
-
-def _move(
-    key: PRNGKeyArray, at: _Extended, b: Array, kind: Array, extend, proposal: Proposal, context: Context
-) -> _Extended:
-    """Metropolis-Hastings of the new object under q^(1-b) target^b. `kind`: 0 a jump to where it looks alike, 1 a walk,
-    2 a fresh draw from q."""
-    draw_key, accept_key = jax.random.split(key)
-    new = jax.lax.switch(
-        kind,
-        (
-            lambda: jump(draw_key, at.new, context.library),
-            lambda: walk(draw_key, at.new, proposal.modes),
-            lambda: propose(draw_key, proposal, at.ancestor.shape[0], context.library, context.table),
-        ),
-    )
-    to = extend(at.ancestor, new)
-    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
-    return metropolis(accept_key, log_accept, to, at)

@@ -66,7 +66,8 @@ def test_the_truth_is_scored_as_the_sampler_scores_it(problem, likelihood):
     assert (image.points is not None) == (likelihood == "points")
     settings = problem.settings
     context = Context(image, problem.library, problem.table)
-    empty = smc.init(context, problem.grid, settings.particles, settings.max_objects, settings.window)
+    size = settings.table_width, settings.table_depth
+    empty = smc.init(context, problem.grid, settings.particles, settings.max_objects, size, settings.window)
     bare = log_likelihood(render(objects, 0, problem), image, problem)
     assert bare == pytest.approx(float(empty.log_likelihood[0]), abs=1e-3)
     assert log_likelihood(surface, image, problem) > bare + 100

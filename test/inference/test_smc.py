@@ -29,8 +29,8 @@ def known(grid, sigma, p_outlier):
     return grid._replace(log_mass=jnp.asarray(mass))
 
 
-def start(context, grid):
-    return smc.init(context, grid, PARTICLES, MAX_OBJECTS, WINDOW)
+def start(context, grid, scene):
+    return smc.init(context, grid, PARTICLES, MAX_OBJECTS, scene.table_size, WINDOW)
 
 
 def step(key, state, count, context, grid, scene):
@@ -87,7 +87,7 @@ def test_evidence_of_one_object(scene, grid, noisy):
     """The mean of Z_hat over seeds is Z, found by enumeration. The box looks the same in four contacts: four modes."""
     truth = scene.contacts((4, 0.02, -0.03, 0.6))
     context = Context(scene.image(noisy(scene.depth(truth), 0.003, 0.05, 0)), scene.arrays, scene.table)
-    empty = start(context, grid)
+    empty = start(context, grid, scene)
     estimates = [
         float(step(jax.random.key(seed), empty, 0, context, grid, scene)[0].log_evidence) for seed in range(20)
     ]
@@ -113,10 +113,10 @@ def test_scenes_are_sets(scene, pair):
     grid, (near, far, both) = pair
     alone = []
     for context in (near, far):
-        empty = start(context, grid)
+        empty = start(context, grid, scene)
         alone.append([float(step(jax.random.key(s), empty, 0, context, grid, scene)[0].log_evidence) for s in range(8)])
     one, two = [], []
-    empty = start(both, grid)
+    empty = start(both, grid, scene)
     for seed in range(10):
         state, _ = step(jax.random.key(seed), empty, 0, both, grid, scene)
         one.append(float(state.log_evidence))
@@ -135,7 +135,7 @@ def test_scenes_are_sets(scene, pair):
 def test_a_third_object_is_not_worth_its_room(scene, pair):
     """Of n = 0..3 with P(n) ~ 0.1^n two is nearly certain; what is left has weights, solids and scenes that agree."""
     grid, (_, _, context) = pair
-    state, evidence = start(context, grid), [0.0]
+    state, evidence = start(context, grid, scene), [0.0]
     assert float(state.log_evidence) == 0 and np.exp(state.log_weight).sum() == pytest.approx(1, abs=1e-4)
     for count in range(3):
         state, info = step(jax.random.key(count), state, count, context, grid, scene)
@@ -161,7 +161,7 @@ def test_a_third_object_is_not_worth_its_room(scene, pair):
 
 def test_a_key_decides_all(scene, pair):
     grid, (context, _, _) = pair
-    empty = start(context, grid)
+    empty = start(context, grid, scene)
     first, again, other = (step(jax.random.key(k), empty, 0, context, grid, scene)[0] for k in (5, 5, 6))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
