@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
+from bayes3d_ros.evaluation.prior_predictive import DepthRange, draw_depth
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
-from bayes3d_ros.inference.noise import log_marginal, noise_grid
+from bayes3d_ros.inference.noise import log_marginal, noise_grid, sample
 from bayes3d_ros.model.scene_graph import Contact, log_prior, overlap
 from bayes3d_ros.model.scene_score import log_likelihood_gain, log_likelihood_scene
 
@@ -166,3 +167,20 @@ def test_a_key_decides_all(scene, pair):
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(first.objects.x, other.objects.x)
+
+
+@pytest.mark.parametrize("p_outlier", [0.03, 0.3, 0.7])
+@pytest.mark.parametrize("sigma", [0.0008, 0.002, 0.004])
+def test_the_noise_of_an_image_is_covered(scene, grid, sigma, p_outlier):
+    """The sigma and p_outlier that an image was drawn with lie in their posteriors, which are narrow."""
+    clean, rays, limits = scene.depth(scene.contacts((4, 0.02, -0.03, 0.6))), scene.camera.rays(), DepthRange(0.1, 5.0)
+    rng = np.random.default_rng(7)
+    depth = draw_depth(rng, clean, rays[0, :, 0], rays[:, 0, 1], (sigma, p_outlier), limits, WINDOW)
+    context = Context(scene.image(depth), scene.arrays, scene.table)
+    state, _ = step(jax.random.key(0), start(context, grid, scene), 0, context, grid, scene)
+    found = jax.jit(sample)(jax.random.key(1), state.table, grid)
+    weight = np.exp(np.asarray(state.log_weight, float))
+    for values, truth, widest in ((found.sigma, sigma, 0.15 * sigma), (found.p_outlier, p_outlier, 0.1)):
+        order = np.argsort(values)
+        low, high = np.asarray(values)[order][np.searchsorted(weight[order].cumsum(), [0.005, 0.995])]
+        assert low <= truth <= high and high - low < widest, (low, truth, high)
