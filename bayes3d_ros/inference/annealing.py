@@ -83,12 +83,6 @@ def jump(key: PRNGKeyArray, contact: Contact, library: LibraryArrays) -> Contact
     return there._replace(yaw=jnp.mod(there.yaw, 2 * jnp.pi))
 
 
-def metropolis(key: PRNGKeyArray, log_accept: Float[Array, "N"], to: Tree, at: Tree) -> Tree:
-    """For each particle the one moved to, with probability min(1, exp(log_accept)), or the one that it is at."""
-    accept = jnp.log(jax.random.uniform(key, log_accept.shape)) < log_accept  # NaN: neither has weight
-    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
-
-
 class Extended(NamedTuple):
     """N scenes, each an ancestor with one more object."""
 
@@ -123,4 +117,5 @@ def move_new(
     )
     to = extend(at.ancestor, new)
     log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
-    return metropolis(accept_key, log_accept, to, at)
+    accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
+    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
