@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
 
 SMALLEST_SPREAD = 1e-9  # in the coordinates' own units; samples that are all one would have no ellipsoid
 
@@ -48,6 +49,24 @@ def ellipsoid(errors: Float[np.ndarray, "S K"], weights: Float[np.ndarray, "S"])
     size = 2 * np.linalg.det(covariance) ** (0.5 / errors.shape[1])
     half, most = quantiles(distance, weights, (0.5, 0.9))
     return Credible(float(nearer), float(half * size), float(most * size), float(np.linalg.norm(mean)))
+
+
+def distance_outside(
+    error: Float[np.ndarray, "K"], covariance: Float[np.ndarray, "K K"], radius: float
+) -> tuple[float, float]:
+    """How far, in the error's unit, the nearest point of the ellipsoid `e C^-1 e <= radius^2` is from this error, 0
+    within it; and the error's own length in standard deviations (Mahalanobis), inf where C has no room for it."""
+    square, axes = np.linalg.eigh(covariance)
+    along2 = (axes.T @ error) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        deviations = float(np.sqrt(np.where(along2 > 0, along2 / np.maximum(square, 0.0), 0.0).sum()))
+    if deviations <= radius:
+        return 0.0, deviations
+    # The nearest point is e_i a_i^2 / (a_i^2 + t) for half axes a_i; t > 0 puts it on the surface.
+    half2 = radius**2 * np.maximum(square, SMALLEST_SPREAD**2)
+    most = np.sqrt((half2 * along2).sum())
+    t = brentq(lambda t: (half2 * along2 / (half2 + t) ** 2).sum() - 1, 0.0, most, xtol=1e-18)
+    return float(t * np.sqrt((along2 / (half2 + t) ** 2).sum())), deviations
 
 
 def quantiles(values: Float[np.ndarray, "S"], weights: Float[np.ndarray, "S"], at: Sequence[float]) -> list[float]:

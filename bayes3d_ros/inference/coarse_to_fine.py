@@ -46,6 +46,7 @@ _LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment 
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _BEHIND = 1e6  # nats
 _WIDE = 120  # pixels across: the search sees smaller images whole, wider ones at half their resolution
+_BLUR = 0.002  # metres: candidates are scored at this sigma at least, or those a pixel beside the peak score as misses
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
@@ -177,8 +178,10 @@ def find_proposal(
     small = Context(halved(image) if fewer == 2 else image, library, table)
     small_depth = pad_scene(depth[::fewer, ::fewer], window)
 
+    blurred = noise._replace(sigma=jnp.maximum(noise.sigma, _BLUR))
+
     def rough(contact: Contact) -> Float[Array, "N"]:
-        return fewer**2 * _gains(contact, small_depth, small, noise, window)
+        return fewer**2 * _gains(contact, small_depth, small, blurred, window)
 
     def table_with(contact: Contact) -> Float[Array, "S P"]:
         """The scene's once the first of these objects explains what it does."""

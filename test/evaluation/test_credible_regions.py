@@ -9,6 +9,7 @@ from bayes3d_ros.evaluation.credible_regions import (
     central_interval,
     circular_mean,
     coverage,
+    distance_outside,
     ellipsoid,
     quantiles,
 )
@@ -99,3 +100,27 @@ def test_weighted_quantiles_are_those_of_repeated_samples():
 
 def test_what_was_not_found_is_not_covered():
     assert coverage([0.1, None, 0.95, None], 0.9).share == 0.25
+
+
+def test_distance_from_a_region_that_is_a_ball():
+    outside, deviations = distance_outside(np.array([0.0, 3e-3, 4e-3]), 1e-6 * np.eye(3), 2.0)
+    assert outside == pytest.approx(3e-3) and deviations == pytest.approx(5.0)
+    assert distance_outside(np.array([1e-3, 0, 0]), 1e-6 * np.eye(3), 2.0)[0] == 0.0
+
+
+def test_the_nearest_point_of_an_ellipsoid_against_a_search_over_its_surface():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(3, 3)) * [3e-3, 1e-3, 2e-4]
+    error, radius = np.array([4e-3, -6e-3, 2e-3]), 2.8
+    unit = rng.normal(size=(400_000, 3))
+    surface = radius * (unit / np.linalg.norm(unit, axis=1, keepdims=True)) @ root.T
+    outside, deviations = distance_outside(error, root @ root.T, radius)
+    assert outside == pytest.approx(np.linalg.norm(surface - error, axis=1).min(), abs=5e-5)
+    assert deviations == pytest.approx(np.linalg.norm(np.linalg.solve(root, error)))
+
+
+@pytest.mark.parametrize("covariance", [np.zeros((3, 3)), np.diag([0.0, 1e-6, 1e-6])])
+def test_a_region_without_room_in_one_direction(covariance):
+    outside, deviations = distance_outside(np.array([2e-3, 1e-4, 0.0]), covariance, 2.0)
+    assert outside == pytest.approx(2e-3, rel=0.01) and np.isinf(deviations)
+    assert distance_outside(np.zeros(3), covariance, 2.0) == (0.0, 0.0)

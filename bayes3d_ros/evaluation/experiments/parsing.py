@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from bayes3d_ros.bags import read_frames
 from bayes3d_ros.evaluation.benchmark import TEN_TYPES, real_recordings, ycb_library, ycb_mesh
+from bayes3d_ros.evaluation.credible_regions import distance_outside
 from bayes3d_ros.evaluation.experiments import Row
 from bayes3d_ros.evaluation.experiments.parsing_plot import plot
 from bayes3d_ros.evaluation.ground_truth import GROUND_TRUTH, GroundTruth, TrueObject
@@ -179,17 +180,19 @@ def _object_row(
 ) -> Row:
     row: Row = {"type": thing.type, "visible_fraction": thing.visible_fraction, "found": estimate is not None}
     row |= dict.fromkeys(("probability", "type_probability", "sigma"))
-    row |= dict.fromkeys(("add_s", "position_error", "rotation_error", "distance", "covered"))
+    row |= dict.fromkeys(("add_s", "position_error", "rotation_error", "distance", "covered", "outside"))
     if estimate is not None:
         row |= _sureness(estimate)
         if thing.T_camera_object is not None:
             pose, truth = _pose(estimate), thing.T_camera_object
-            distance = _mahalanobis(truth[:3, 3] - estimate.position, estimate.covariance[:3, :3])
+            error, covariance = truth[:3, 3] - estimate.position, np.asarray(estimate.covariance[:3, :3], float)
+            outside, distance = distance_outside(error, covariance, REGION)
             row["add_s"] = round(add_s(surfaces(thing.type), truth, pose), 7)
             row["position_error"] = round(translation_error(truth, pose), 7)
             row["rotation_error"] = round(np.radians(rotation_error_degrees(truth, pose)), 6)
             row["distance"] = round(distance, 4) if np.isfinite(distance) else None
             row["covered"] = bool(distance <= REGION)
+            row["outside"] = round(outside, 7)
     return row
 
 
@@ -199,15 +202,6 @@ def _sureness(estimate: ObjectEstimate) -> Row:
         "type_probability": round(float(estimate.type_probabilities[estimate.type]), 6),
         "sigma": round(float(np.sqrt(np.trace(estimate.covariance[:3, :3]))), 7),
     }
-
-
-def _mahalanobis(error: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> float:
-    """How many standard deviations off; inf where the covariance says that it cannot be."""
-    try:
-        square = float(error @ np.linalg.solve(covariance, error))
-    except np.linalg.LinAlgError:
-        square = 0.0 if not error.any() else np.inf
-    return float(np.sqrt(square)) if square >= 0 else np.inf
 
 
 def _pose(estimate: ObjectEstimate) -> Float[np.ndarray, "4 4"]:
@@ -272,7 +266,7 @@ def _sugar_box(rows: list[Row]) -> Row | None:
     if box is None:
         return None
     listed = sum(row["what"] == "false object" for row in rows) + bool(box["found"])
-    keys = ("found", "probability", "type_probability", "add_s", "sigma")
+    keys = ("found", "probability", "type_probability", "add_s", "sigma", "distance", "outside")
     return {"listed_objects": listed, **{key: box[key] for key in keys}}
 
 
