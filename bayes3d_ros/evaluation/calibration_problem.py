@@ -98,7 +98,7 @@ def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
-    grid = noise_model.noise_grid(settings.sigma_max)
+    grid = noise_model.for_returns(noise_model.noise_grid(settings.sigma_max), blank.kind)
     return Problem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
 
 

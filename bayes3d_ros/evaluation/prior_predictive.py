@@ -75,12 +75,10 @@ def _proposals(
 
 
 def draw_noise(rng: np.random.Generator, grid: NoiseGrid) -> tuple[float, float]:
-    """(sigma, p_outlier) from the very prior that is integrated: the fine grid's points with their masses. They stand
-    for U(0, sigma_max) and U(0, 1) without the tenths of each that lie beyond the grid's ends."""
-    log_mass = np.asarray(grid.log_mass, np.float64)
-    reached = np.cumsum(np.exp(log_mass))
-    s, p = divmod(int(np.searchsorted(reached, rng.random() * reached[-1])), log_mass.shape[1])
-    return float(grid.fine.sigma[s]), float(grid.fine.p_outlier[p])
+    """(sigma, p_outlier) from the prior that is integrated: U(0, sigma_max) and U(0, 1) without the tenths of each that
+    lie beyond the grid's ends."""
+    sigma, p_outlier = grid.coarse
+    return float(rng.uniform(sigma[0], sigma[-1])), float(rng.uniform(p_outlier[0], p_outlier[-1]))
 
 
 def draw_depth(

@@ -14,6 +14,7 @@ from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, u
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
+from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
@@ -73,8 +74,8 @@ class SceneParser:
         with contextlib.suppress(ParseError):  # unusual settings may leave nothing of the frame
             self.parse(frame)
             image, table, *_ = self._observe(frame)
-            context = Context(image, self._arrays, table)
-            self._refreshed(_frame_key(0, 0), self._empty(context), self.settings.max_objects, context)
+            context, grid = Context(image, self._arrays, table), noise_model.for_returns(self._grid, image.kind)
+            self._refreshed(_frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
         rays = jnp.zeros((height, width))
         self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
 
@@ -83,8 +84,8 @@ class SceneParser:
         start = time.perf_counter()
         settings = self.settings
         image, table, T_camera_table, notes = self._observe(frame)
-        context = Context(image, self._arrays, table)
-        stages, ess = self._sample(_frame_key(settings.seed, frame.stamp_ns), context)
+        context, grid = Context(image, self._arrays, table), noise_model.for_returns(self._grid, image.kind)
+        stages, ess = self._sample(_frame_key(settings.seed, frame.stamp_ns), context, grid)
         samples, log_evidence = self._mix(stages, table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
         reconstruction, segmentation = self._reconstruct(frame, T_camera_table, samples, summary)
@@ -156,12 +157,14 @@ class SceneParser:
             raise ParseError("no camera pose for this frame, and table:=pose expects one")
         return table_frame(find_plane(points), points), ["table found in the depth image"]
 
-    def _sample(self, key: PRNGKeyArray, context: Context) -> tuple[list[_Stage], list[float]]:
+    def _sample(
+        self, key: PRNGKeyArray, context: Context, grid: NoiseGrid
+    ) -> tuple[list[_Stage], list[float]]:
         """Stages of the sampler, from the empty table to more objects than the image bears out."""
         settings = self.settings
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
-        state = self._empty(context)
+        state = self._empty(context, grid)
         stages: list[_Stage] = []
         ess, log_mass = [], [0.0]
         for count in range(last):
@@ -171,7 +174,7 @@ class SceneParser:
                 state,
                 jnp.int32(count),
                 context,
-                self._grid,
+                grid,
                 self._table_size,
                 settings.window,
                 settings.ess_threshold,
@@ -180,25 +183,27 @@ class SceneParser:
             log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
             matters = log_mass[-2] > log_mass[-1] + _NO_SAMPLE
             if log_mass[-2] == max(log_mass):
-                before = self._refreshed(key, before, count, context)
-            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, matters))
+                before = self._refreshed(key, before, count, context, grid)
+            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, grid, matters))
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
                 break
         if log_mass[-1] == max(log_mass):
-            state = self._refreshed(key, state, len(ess), context)
-        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, context))
+            state = self._refreshed(key, state, len(ess), context, grid)
+        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, context, grid))
         if fixed:
             if len(stages) != settings.fixed_objects + 1 or not np.isfinite(stages[-1].log_evidence):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
             stages = stages[-1:]
         return stages, ess
 
-    def _empty(self, context: Context) -> smc.State:
+    def _empty(self, context: Context, grid: NoiseGrid) -> smc.State:
         settings = self.settings
         slots = max(settings.max_objects, 1)
-        return smc.init(context, self._grid, settings.particles, slots, self._table_size, settings.window)
+        return smc.init(context, grid, settings.particles, slots, self._table_size, settings.window)
 
-    def _refreshed(self, key: PRNGKeyArray, state: smc.State, count: int, context: Context) -> smc.State:
+    def _refreshed(
+        self, key: PRNGKeyArray, state: smc.State, count: int, context: Context, grid: NoiseGrid
+    ) -> smc.State:
         """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
         reheating."""
         settings = self.settings
@@ -207,17 +212,19 @@ class SceneParser:
         key = jax.random.fold_in(key, 2000 + count)
         effort = Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating))
         return smc.refresh(
-            key, state, jnp.int32(count), context, self._grid, settings.window, settings.ess_threshold, effort
+            key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort
         )
 
-    def _keep(self, key: PRNGKeyArray, state: smc.State, context: Context, matters: bool = True) -> _Stage:
+    def _keep(
+        self, key: PRNGKeyArray, state: smc.State, context: Context, grid: NoiseGrid, matters: bool = True
+    ) -> _Stage:
         """A stage's scenes; only its evidence where they do not matter."""
         if not matters:
             none = jax.tree.map(lambda a: np.zeros((0, *a.shape[1:]), a.dtype), state.objects)
             nobody = np.zeros((0, *none.x.shape[1:], 3), np.float32)
             zero = np.zeros(0, np.float32)
             return _Stage(none, nobody, np.zeros((0, 3), np.float32), zero, zero, zero, float(state.log_evidence))
-        noise = self._sample_noise(key, state.table, self._grid)
+        noise = self._sample_noise(key, state.table, grid)
         error, window = self._smooth_error, self.settings.window
         offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
         height, tilt = jnp.float32(self.settings.table_height_sigma), jnp.float32(self.settings.table_tilt_sigma)
