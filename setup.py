@@ -63,6 +63,7 @@ setup(
         "console_scripts": [
             "bayes3d = bayes3d_ros.cli:main",
             "scene_parser = bayes3d_ros.ros.scene_parser:main",
+            "object_learner = bayes3d_ros.ros.object_learner:main",
             "bag_player = bayes3d_ros.ros.bag_player:main",
         ],
     },

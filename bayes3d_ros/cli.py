@@ -5,7 +5,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
     from bayes3d_ros.model.objects import Library
     from bayes3d_ros.model.posterior import ScenePosterior
 
+Settings = TypeVar("Settings")
 FOLDER = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 ANY = click.Path(path_type=Path)
@@ -87,10 +88,11 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from bayes3d_ros.evaluation.results import ResultsError
     from bayes3d_ros.evaluation.scene_file import SimulationError
     from bayes3d_ros.geometry.mesh import MeshError
+    from bayes3d_ros.inference.object_learning import LearningError
     from bayes3d_ros.mcap_files import BagError
     from bayes3d_ros.model.objects import LibraryError
 
-    return BagError, LibraryError, MeshError, ResultsError, SimulationError
+    return BagError, LearningError, LibraryError, MeshError, ResultsError, SimulationError
 
 
 @click.group(cls=_OneLineErrors, context_settings={"help_option_names": ["-h", "--help"]})
@@ -140,9 +142,10 @@ def _choose_device(device: str | None) -> None:
 def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
     """Parse every depth frame of BAG into a posterior over scenes."""
     from bayes3d_ros.bags import read_frames
+    from bayes3d_ros.inference.settings import ParserSettings
     from bayes3d_ros.model.objects import load_library
 
-    settings = _parser_settings(more, options)
+    settings = _settings(ParserSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic)
     done, failed = _parse_frames(frames, models, settings, out)
@@ -152,12 +155,11 @@ def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     click.echo(f"{parsed}; results in {out}")
 
 
-def _parser_settings(more: tuple[str, ...], options: dict[str, Any]) -> "ParserSettings":
+def _settings(kind: type["Settings"], more: tuple[str, ...], options: dict[str, Any]) -> "Settings":
+    """Settings from the command's own options and from --set NAME=VALUE."""
     from dataclasses import fields
 
-    from bayes3d_ros.inference.settings import ParserSettings
-
-    kinds: dict[str, type] = {f.name: type(f.default) for f in fields(ParserSettings)}
+    kinds: dict[str, type] = {f.name: type(f.default) for f in fields(kind)}  # type: ignore[arg-type]
     chosen = {name: value for name, value in options.items() if value is not None}
     for text in more:
         name, _, value = text.partition("=")
@@ -168,7 +170,7 @@ def _parser_settings(more: tuple[str, ...], options: dict[str, Any]) -> "ParserS
         except (ValueError, KeyError):
             raise InputError(f"--set {text}: expected {name}={kinds[name].__name__}") from None
     try:
-        return ParserSettings(**chosen)
+        return kind(**chosen)
     except ValueError as error:
         raise InputError(f"settings: {error}") from error
 
@@ -223,6 +225,50 @@ def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float) -> None:
         _say(f"{done.model}  {done.model.stat().st_size / 1000:.1f} kB")
         if done.warning:
             _say(f"{done.mesh}: {done.warning}", err=True)
+
+
+@main.command()
+@click.argument("bag", type=ANY)
+@click.option("--name", required=True, help="What to call the object: letters, digits, '_' and '-'.")
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
+@click.option("--voxel-size", type=float, help="Metres; default 0.004.")
+@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--views", type=click.IntRange(1, 10), default=10, show_default=True, help="Most views to use.")
+@click.option("--cluster", type=click.Choice(["only", "largest", "central"]), help="Which of several things to learn.")
+@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
+def learn(
+    bag: Path, name: str, library: Path, topic: str | None, views: int, more: tuple[str, ...], **options: Any
+) -> None:
+    """Learn a model of an object from views of it: depth, CameraInfo and camera_pose of one stamp each."""
+    from bayes3d_ros.bags import read_frames
+    from bayes3d_ros.evaluation.model_plot import plot_model
+    from bayes3d_ros.inference.object_learning import check_name, spread_views
+    from bayes3d_ros.inference.object_learning import learn as learn_model
+    from bayes3d_ros.inference.settings import LearnerSettings
+    from bayes3d_ros.model.objects import save_model
+
+    check_name(name)
+    settings = _settings(LearnerSettings, more, options)
+    reader = read_frames(bag, topic)
+    poses = [frame.T_table_camera for frame in _progress(reader, len(reader), "frame")]
+    chosen = set(spread_views(poses, views))
+    if not chosen:
+        raise InputError(
+            f"{bag}: {reader.depth_topic}: none of its {len(poses)} frames has a camera_pose (PoseStamped) of its stamp"
+        )
+    frames = [frame for k, frame in enumerate(reader) if k in chosen]
+    learned = learn_model(frames, name, settings)
+    for number, view in enumerate(learned.views, 1):
+        told = view.refused or (
+            f"{view.points} points, pose corrected by {1e3 * view.shift:.1f} mm, {view.turn * 57.29578:.2f} degrees"
+        )
+        click.echo(f"view {number}  {view.stamp_ns}  {'left out: ' * bool(view.refused)}{told}", err=bool(view.refused))
+    model, size = learned.model, " x ".join(f"{v:.3f}" for v in learned.model.box_size)
+    used = sum(not view.refused for view in learned.views)
+    click.echo(f"{name}: {size} m, {len(model.surface_index)} surface voxels, {learned.coverage:.0%} of them seen")
+    title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
+    click.echo(f"{save_model(model, library)}")
+    click.echo(f"{plot_model(model, library / f'{name}.png', title)}")
 
 
 @main.command()

@@ -15,8 +15,9 @@ from bayes3d_ros import cli
 from bayes3d_ros.bags import BagWriter
 from bayes3d_ros.inference import scene_parsing
 from bayes3d_ros.model.mesh_import import model_from_mesh
-from bayes3d_ros.model.objects import save_model
+from bayes3d_ros.model.objects import load_library, save_model
 from bayes3d_ros.model.posterior import ParseError
+from bayes3d_ros.resources import share_directory
 
 
 @pytest.fixture
@@ -256,3 +257,33 @@ def test_help_does_not_load_what_is_heavy():
 def test_the_demo_without_ros_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "bayes3d_ros.ros.demo", None)
     assert_one_line(run("demo", "--out", tmp_path / "out"), 1, "ROS 2 Jazzy")
+
+
+def test_learn_writes_a_model_and_its_picture(tmp_path):
+    bag = share_directory() / "bags" / "views_mustard_bottle"
+    options = ["--name", "mustard", "--library", str(tmp_path / "library"), "--voxel-size", "0.006", "--views", "2"]
+    result = CliRunner().invoke(cli.main, ["learn", str(bag), *options])
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert [line.split()[0:2] for line in lines[:2]] == [["view", "1"], ["view", "2"]]
+    assert all("pose corrected by" in line for line in lines[:2])
+    (model,) = load_library(tmp_path / "library").models
+    assert model.name == "mustard" and model.surface_views.max() == 2
+    assert (tmp_path / "library" / "mustard.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--name", "a/b"], "name: expected letters, digits, '_' and '-', got 'a/b'"),
+        (["--name", "a", "--voxel-size", "2"], "settings: voxel_size must lie in [0.001, 0.05] m, got 2.0"),
+        (["--name", "a", "--set", "nothing=1"], "--set nothing=1: expected one of voxel_size"),
+        (["--name", "a", "--topic", "/x"], "expected a topic /x of type sensor_msgs/msg/Image"),
+        (["--name", "a"], "3 things stand in the workspace"),
+    ],
+)
+def test_learn_says_in_one_line_what_is_wrong(tmp_path, options, message):
+    bag = share_directory() / "bags" / "three_objects"
+    result = CliRunner().invoke(cli.main, ["learn", str(bag), "--library", str(tmp_path / "library"), *options])
+    assert result.exit_code == 2 and message in result.output and result.output.count("\n") == 1
+    assert not (tmp_path / "library").exists()

@@ -38,6 +38,7 @@ class Scene:
     start_ns: int  # stamp of the first frame
     intrinsics: Intrinsics
     cameras: tuple[Float[np.ndarray, "4 4"], ...]  # T_table_camera of every frame
+    pose_noise: tuple[float, float]  # metres and radians by which recorded camera poses are wrong
     table_size: tuple[float, float]
     table_height: float  # above the floor
     objects: tuple[SceneObject, ...]
@@ -98,7 +99,7 @@ def find_mesh(source: str, folder: Path) -> trimesh.Trimesh:
 def _scene(path: Path, content: Any) -> Scene:
     keys = ("seed", "rate", "start", "camera", "table", "objects", "noise")
     top = _mapping(content, "the scene", keys)
-    camera = _mapping(top.get("camera", {}), "camera", ("intrinsics", "eye", "target", "frames", "step"))
+    camera = _mapping(top.get("camera", {}), "camera", ("intrinsics", "eye", "target", "frames", "step", "pose_noise"))
     pinhole = _INTRINSICS | _mapping(camera.get("intrinsics"), "camera.intrinsics", tuple(_INTRINSICS))
     fx, fy, cx, cy = (_number(pinhole[key], f"camera.intrinsics.{key}") for key in ("fx", "fy", "cx", "cy"))
     columns, rows = (_whole(pinhole[key], f"camera.intrinsics.{key}", 1) for key in ("width", "height"))
@@ -110,6 +111,9 @@ def _scene(path: Path, content: Any) -> Scene:
     rate = _number(top.get("rate", 10), "rate")
     if rate <= 0:
         raise ValueError(f"rate: expected frames a second > 0, got {rate}")
+    off = _vector(camera.get("pose_noise", [0, 0]), "camera.pose_noise", 2)
+    if not (off >= 0).all():
+        raise ValueError(f"camera.pose_noise: expected metres and degrees >= 0, got {off.tolist()}")
     size = _vector(table.get("size", [1.2, 0.8]), "table.size", 2)
     height = _number(table.get("height", 0.75), "table.height")
     if not (size > 0).all() or height <= 0:
@@ -128,6 +132,7 @@ def _scene(path: Path, content: Any) -> Scene:
         start_ns=start * 10**9,
         intrinsics=intrinsics,
         cameras=cameras,
+        pose_noise=(off[0], np.radians(off[1])),
         table_size=(size[0], size[1]),
         table_height=height,
         objects=tuple(_object(entry, f"objects[{i}]", path.parent) for i, entry in enumerate(objects)),

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from bayes3d_ros.bags import BagWriter
 from bayes3d_ros.evaluation.correlated_errors import draw_correlated_errors
+from bayes3d_ros.evaluation.pose_noise import disturbed
 from bayes3d_ros.evaluation.ray_casting import Box, RayCaster, Rendering
 from bayes3d_ros.evaluation.scene_file import Scene, load_scene
 from bayes3d_ros.evaluation.sensor_noise import add_sensor_noise, draw_bias_field
@@ -50,9 +51,11 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
     """
     scene = load_scene(scene_yaml)
     caster = scene_caster(scene)
-    camera_seed, *frame_seeds, surface_seed = np.random.SeedSequence(scene.seed).spawn(2 + len(scene.cameras))
+    seeds = np.random.SeedSequence(scene.seed).spawn(3 + len(scene.cameras))
+    camera_seed, *frame_seeds, surface_seed, pose_seed = seeds
     bias = draw_bias_field(scene.noise, np.random.default_rng(camera_seed))
     errors = draw_correlated_errors(scene.noise, len(scene.objects), np.random.default_rng(surface_seed))
+    pose_rng = np.random.default_rng(pose_seed)
     truth = []
     with BagWriter(out) as bag:
         for index, T_table_camera in enumerate(scene.cameras):
@@ -61,7 +64,8 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
             rng = np.random.default_rng(frame_seeds[index])
             depth = clean.depth + errors.at(clean, T_table_camera, scene.intrinsics)
             depth = add_sensor_noise(depth, clean.cosine, scene.intrinsics, scene.noise, bias, rng)
-            bag.write(DepthFrame(depth, scene.intrinsics, stamp, FRAME_ID, T_table_camera))
+            told = disturbed(T_table_camera, *scene.pose_noise, pose_rng)
+            bag.write(DepthFrame(depth, scene.intrinsics, stamp, FRAME_ID, told))
             truth.append(_truth(scene, stamp, T_table_camera, visible_fractions(scene, index, clean)))
             if progress is not None:
                 progress(index + 1, len(scene.cameras))

@@ -48,8 +48,8 @@ class NoiseGrid(NamedTuple):
 def noise_grid(sigma_max: float) -> NoiseGrid:
     """sigma ~ U(0, sigma_max) and p_outlier ~ U(0, 1), both proper; the mass below the grid's ends is left out.
 
-    Each return's log(p a + (1 - p) b) is log(a e^v + b) + log(1 - p), v = logit p: the first term is nearly straight in v
-    where a return is clearly the one or the other, the second bends and is known. So what splines make of it is taken
+    Each return's log(p a + (1 - p) b) is log(a e^v + b) + log(1 - p), v = logit p: the first term is nearly straight in
+    v where a return is clearly the one or the other, the second bends and is known. So what splines make of it is taken
     out again, times the number of returns (`for_returns`); none as it comes from here.
     """
     u = np.log(sigma_max) - np.log(2) / 3 * np.arange(_SIGMA_STEPS)[::-1]
@@ -117,8 +117,9 @@ def log_marginal(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, 
 
 def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
     """One draw of (sigma, p_outlier) per particle given its scene: sigma on the fine grid, p_outlier given it and then
-    sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough to sum,
-    but its step can be wider than a standard deviation of p_outlier: drawn evenly from it, 50 % intervals hold 58 %."""
+    sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough to
+    sum, but its step can be wider than a standard deviation of p_outlier: drawn evenly from it, 50 % intervals hold
+    58 %."""
     s_key, p_key, sigma_key = jax.random.split(key, 3)
     s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(table, grid), -1))
     exact = jax.lax.Precision.HIGHEST

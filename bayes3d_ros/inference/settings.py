@@ -91,3 +91,34 @@ class ParserSettings:
             raise ValueError(f"fixed_objects ({self.fixed_objects}) exceeds max_objects ({self.max_objects})")
         if self.near >= self.far:
             raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """Settings of the object learner. Lengths are metres in the table frame."""
+
+    voxel_size: float = setting(0.004, "edge of a voxel of the learned model", unit="m", low=0.001, high=0.05)
+    workspace_x: float = setting(0.0, "middle of the workspace, along x of the table frame", unit="m")
+    workspace_y: float = setting(0.0, "middle of the workspace, along y of the table frame", unit="m")
+    workspace_width: float = setting(1.0, "extent of the workspace along x", unit="m", low=0.05, high=10.0)
+    workspace_depth: float = setting(1.0, "extent of the workspace along y", unit="m", low=0.05, high=10.0)
+    workspace_height: float = setting(
+        0.5, "returns higher above the table are left out", unit="m", low=0.02, high=10.0
+    )
+    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
+    far: float = setting(3.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
+    gap: float = setting(0.02, "things that stand this far apart are several", unit="m", low=0.002, high=1.0)
+    cluster: str = setting(
+        "only",
+        "which of several things to learn: refuse to choose, the largest, or the one nearest to the workspace's middle",
+        choices=("only", "largest", "central"),
+    )
+    max_shift: float = setting(
+        0.03, "largest error of a camera pose that is corrected, at the object", unit="m", low=0.0, high=0.5
+    )
+    max_turn: float = setting(0.09, "largest such error of its orientation", unit="rad", low=0.0, high=0.5)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.near >= self.far:
+            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")

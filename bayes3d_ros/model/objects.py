@@ -48,6 +48,7 @@ class ObjectModel:
     contact_normal: Float[np.ndarray, "6 3"]
     contact_height: Float[np.ndarray, "6"]
     provenance: dict = field(default_factory=dict)  # where it came from; JSON values
+    surface_views: Int[np.ndarray, "S"] | None = None  # how many views saw each surface voxel; None: not learned
 
     def __post_init__(self) -> None:
         _check(self)
@@ -94,6 +95,8 @@ def _check(model: ObjectModel) -> None:
             raise ValueError(f"{name} must hold unit vectors")
     if (np.abs(model.surface_offset) > np.sqrt(3) / 2 * model.voxel_size * 1.001).any():
         raise ValueError("surface_offset lies outside its voxel")
+    if model.surface_views is not None and model.surface_views.shape != model.surface_offset.shape:
+        raise ValueError(f"surface_views must have one number a surface voxel, got shape {model.surface_views.shape}")
     rotation = model.T_object_box[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise ValueError("T_object_box must be a rigid transform")
@@ -146,6 +149,8 @@ def save_model(model: ObjectModel, folder: Path) -> Path:
         ).astype(np.float64),
         "contact_normal": model.contact_normal.astype(np.float64),
     }
+    if model.surface_views is not None:
+        arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
     path = folder / f"{model.name}.npz"
     handle, temporary = tempfile.mkstemp(prefix=f".{model.name}-", suffix=".tmp", dir=folder)
     try:
@@ -220,6 +225,7 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
         contact_normal=arrays["contact_normal"],
         contact_height=frames[18:],
         provenance=meta["provenance"],
+        surface_views=arrays["surface_views"].astype(int) if "surface_views" in arrays else None,
     )
 
 

@@ -12,18 +12,16 @@ from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeExce
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bayes3d_ros.inference.settings import ParserSettings, setting, validate
+from bayes3d_ros.inference.settings import LearnerSettings, ParserSettings, setting, validate
 from bayes3d_ros.ros.conversions import matrix_from_values
 
 Settings = TypeVar("Settings")
 
 
 @dataclass(frozen=True)
-class SceneParserNodeSettings:
-    """What the scene_parser node needs beside the parser's own settings."""
+class DepthInputSettings:
+    """How a node listens to a depth camera."""
 
-    library: str = setting("", "folder of object models (bayes3d import); read on configure and on reload")
-    autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
     qos_reliability: str = setting(
         "auto",
         "reliability of the input subscriptions; auto is reliable until a best-effort publisher is met",
@@ -33,8 +31,6 @@ class SceneParserNodeSettings:
     camera_pose: tuple[float, ...] = setting(
         (), "camera pose in table_frame where no topic or tf gives one: x y z qx qy qz qw; empty for none"
     )
-    warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
-    warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
     patience: float = setting(
         0.5, "how long an image waits for its CameraInfo and camera pose", unit="s", low=0.0, high=10.0
     )
@@ -48,7 +44,30 @@ class SceneParserNodeSettings:
                 raise ValueError(f"camera_pose: {error}") from None
 
 
+@dataclass(frozen=True)
+class SceneParserNodeSettings(DepthInputSettings):
+    """What the scene_parser node needs beside the parser's own settings."""
+
+    library: str = setting("", "folder of object models (bayes3d import); read on configure and on reload")
+    autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
+    warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
+    warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
+
+
+@dataclass(frozen=True)
+class ObjectLearnerNodeSettings(DepthInputSettings):
+    """What the object_learner node needs beside the learner's own settings."""
+
+    library: str = setting("", "folder of object models; captures are kept in its subfolder captures/OBJECT_NAME")
+    object_name: str = setting("", "what to call the object: letters, digits, '_' and '-'")
+    max_age: float = setting(
+        2.0, "the newest image is not captured if it came longer ago than this", unit="s", low=0.1, high=3600.0
+    )
+
+
 SCENE_PARSER_SETTINGS: tuple[type, ...] = (SceneParserNodeSettings, ParserSettings)
+OBJECT_LEARNER_SETTINGS: tuple[type, ...] = (ObjectLearnerNodeSettings, LearnerSettings)
+NODE_SETTINGS = {"scene_parser": SCENE_PARSER_SETTINGS, "object_learner": OBJECT_LEARNER_SETTINGS}
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
 
 
@@ -164,7 +183,7 @@ def _typed(field: Field, value: Any) -> Any:
 def yaml_text(node_name: str, kinds: tuple[type, ...]) -> str:
     """A parameter file with every setting at its default, its description, unit, range and choices above it."""
     lines = [
-        f"# Parameters of {node_name} and their defaults. Written by `python -m bayes3d_ros.ros.parameters`;",
+        f"# Parameters of {node_name} and their defaults. Written by `python -m bayes3d_ros.ros.parameters NODE`;",
         "# a test compares this file with the settings' dataclasses.",
         f"/**/{node_name}:",
         "  ros__parameters:",
@@ -192,4 +211,4 @@ def _limits(field: Field) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(yaml_text("scene_parser", SCENE_PARSER_SETTINGS))
+    sys.stdout.write(yaml_text(sys.argv[1], NODE_SETTINGS[sys.argv[1]]))

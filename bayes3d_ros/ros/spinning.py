@@ -25,6 +25,14 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     """Spin a node until SIGINT, SIGTERM or a shutdown of ROS; the exit status is 0 for all of them."""
     node = None
     stopped = True
+    interrupted = False
+
+    def interrupt(number: int, frame: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
         use_large_messages()
         rclpy.init(args=args)
@@ -33,7 +41,9 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        if rclpy.ok():  # a signal between two calls of rclpy leaves the second one without a context
+        # A signal between two calls of rclpy leaves the second one without a context; one while a message is taken
+        # comes out as another exception.
+        if rclpy.ok() and not interrupted:
             raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean end short

@@ -48,6 +48,11 @@ class Ros:
         self._processes.append(process)
         return process
 
+    def kill(self, process: NodeProcess) -> None:
+        """kill -9, as part of a test."""
+        process.stop(signal.SIGKILL)
+        self._processes.remove(process)
+
     def start_parser(self, library: Path | str, *arguments: str, **parameters: Any) -> NodeProcess:
         """Start scene_parser with a fake parser. `arguments` come before the ROS arguments."""
         pairs = {"library": library, "patience": 0.2, **parameters}

@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.parameters import (
+    NODE_SETTINGS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
     SettingsParameters,
@@ -42,13 +43,15 @@ def with_values(*values: str) -> pytest.param:
     return [word for value in values for word in ("-p", value)]
 
 
-def test_the_yaml_file_is_in_step_with_the_settings() -> None:
-    file = share_directory() / "config" / "scene_parser.yaml"
-    expected = yaml_text("scene_parser", SCENE_PARSER_SETTINGS)
-    assert file.read_text() == expected, f"python -m bayes3d_ros.ros.parameters > {file}"
-    values = yaml.safe_load(expected)["/**/scene_parser"]["ros__parameters"]
-    assert values.keys() == {f.name for kind in SCENE_PARSER_SETTINGS for f in fields(kind)}
-    assert {k: values[k] for k in asdict(ParserSettings())} == asdict(ParserSettings())
+@pytest.mark.parametrize("node", NODE_SETTINGS)
+def test_the_yaml_file_is_in_step_with_the_settings(node: str) -> None:
+    file = share_directory() / "config" / f"{node}.yaml"
+    expected = yaml_text(node, NODE_SETTINGS[node])
+    assert file.read_text() == expected, f"python -m bayes3d_ros.ros.parameters {node} > {file}"
+    values = yaml.safe_load(expected)[f"/**/{node}"]["ros__parameters"]
+    assert values.keys() == {f.name for kind in NODE_SETTINGS[node] for f in fields(kind)}
+    core = asdict(NODE_SETTINGS[node][1]())
+    assert {k: values[k] for k in core} == core
 
 
 def test_defaults_are_the_settings_defaults(declared: tuple[Node, SettingsParameters]) -> None:

@@ -14,6 +14,7 @@ EXPERIMENTS: dict[str, str] = {
     "coverage": "bayes3d_ros.evaluation.experiments.coverage",
     "dial": "bayes3d_ros.evaluation.experiments.dial",
     "exactness": "bayes3d_ros.evaluation.experiments.exactness",
+    "learning": "bayes3d_ros.evaluation.experiments.learning",
     "parsing": "bayes3d_ros.evaluation.experiments.parsing",
 }
 

@@ -1,0 +1,243 @@
+"""Learn a voxel model of an unknown object from a few calibrated depth views of it on the table."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from bayes3d_ros.geometry.camera import project
+from bayes3d_ros.inference.settings import LearnerSettings
+from bayes3d_ros.inference.view_alignment import align_views, moved
+from bayes3d_ros.inference.view_segmentation import Thing, View, ViewError, segment
+from bayes3d_ros.inference.voxel_fusion import Fused, FusionError, Seen, fuse
+from bayes3d_ros.model.mesh_import import contact_normals
+from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel
+from bayes3d_ros.model.observation import DepthFrame
+
+MOST_VIEWS = 10
+_BEHIND = 0.015  # metres: a view that sees something so far behind a point sees through it
+_CONTRADICTED = 0.25  # share of a view's points that others see through, on average, from which it must go
+
+
+class LearningError(Exception):
+    """Views that no model can be made of; one line that says why."""
+
+
+@dataclass(frozen=True)
+class ViewReport:
+    """What became of one view."""
+
+    stamp_ns: int
+    points: int  # on the object
+    shift: float  # metres by which its pose was corrected, at the object
+    turn: float  # radians
+    refused: str = ""  # why nothing of it is in the model
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A model and how it came about. `coverage` is the share of its surface that some view saw."""
+
+    model: ObjectModel
+    T_table_object: Float[np.ndarray, "4 4"]  # where it stood
+    views: tuple[ViewReport, ...]
+    coverage: float
+
+
+def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | None = None) -> Learned:
+    """The model of the object that these frames show. Its frame has z up as captured, x and y along the table's, and
+    its origin at the centre of its box's base. Raises LearningError with one line where none can be made."""
+    settings = settings or LearnerSettings()
+    check_name(name)
+    if not 1 <= len(frames) <= MOST_VIEWS:
+        raise LearningError(f"expected 1 to {MOST_VIEWS} views, got {len(frames)}")
+    views: dict[int, View] = {}
+    refused: dict[int, str] = {}
+    for k, frame in enumerate(frames):
+        try:
+            views[k] = segment(frame, settings)
+        except ViewError as error:
+            refused[k] = str(error)
+    things = choose_things(views, settings)
+    while True:
+        if not things:
+            reasons = "; ".join(f"view {k + 1}: {why}" for k, why in sorted(refused.items()))
+            raise LearningError(f"none of {len(frames)} views can be used: {reasons}")
+        used = sorted(things)
+        shifts = dict(zip(used, align_views([things[k] for k in used]), strict=True))
+        aligned = {k: moved(things[k], shifts[k]) for k in used}
+        poses = {k: shifts[k].matrix() @ views[k].T_table_camera for k in used}
+        worst, why = _worst(frames, views, aligned, poses, settings)
+        if worst is None:
+            break
+        refused[worst] = why
+        del things[worst]
+    try:
+        fused = fuse([Seen(aligned[k], frames[k], poses[k]) for k in used], settings.voxel_size)
+    except FusionError as error:
+        raise LearningError(str(error)) from None
+    reports = tuple(
+        ViewReport(frame.stamp_ns, 0, 0.0, 0.0, refused[k])
+        if k in refused
+        else ViewReport(frame.stamp_ns, len(things[k].points), *_correction(frame, poses[k], aligned[k]))
+        for k, frame in enumerate(frames)
+    )
+    model, T_table_object = _model(name, fused, reports, settings)
+    return Learned(model, T_table_object, reports, float((fused.views > 0).mean()))
+
+
+def check_name(name: str) -> None:
+    """Raise LearningError where a model cannot be called so."""
+    if not NAME_PATTERN.fullmatch(name):
+        raise LearningError(f"name: expected letters, digits, '_' and '-', got {name!r}")
+
+
+def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) -> list[int]:
+    """Which of many frames to learn from: those with a pose, as far apart as can be, at most `most`."""
+    there = [k for k, pose in enumerate(poses) if pose is not None]
+    if len(there) <= most:
+        return there
+    places = np.array([pose[:3, 3] for pose in poses if pose is not None])
+    chosen = [0]
+    while len(chosen) < most:
+        apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)
+        chosen.append(int(apart.argmax()))
+    return sorted(there[k] for k in chosen)
+
+
+def choose_things(views: dict[int, View], settings: LearnerSettings) -> dict[int, Thing]:
+    """In every view the thing to learn: as `cluster` says in the first, in the others the one that stands there."""
+    chosen: dict[int, Thing] = {}
+    for k, view in views.items():
+        if chosen:
+            there = np.mean([thing.middle for thing in chosen.values()], 0)
+            chosen[k] = min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
+        else:
+            chosen[k] = choose_thing(view, settings)
+    return chosen
+
+
+def choose_thing(view: View, settings: LearnerSettings) -> Thing:
+    """The thing to learn of those in a view. Raises LearningError where there are several and `cluster` is "only"."""
+    if settings.cluster == "central":
+        middle = np.array([settings.workspace_x, settings.workspace_y])
+        return min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - middle)))
+    if settings.cluster == "only" and len(view.things) > 1:
+        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in (thing.middle for thing in view.things))
+        raise LearningError(
+            f"{len(view.things)} things stand in the workspace, at x, y = {places} m: expected one, "
+            "or cluster largest or central, or a smaller workspace"
+        )
+    return view.things[0]
+
+
+def new_share(thing: Thing, before: Sequence[Thing], voxel_size: float) -> float:
+    """Share of the voxels that a view sees of an object which none of the views before it saw."""
+    here = _voxels(thing, voxel_size)
+    known: set[tuple[int, ...]] = set().union(*(_voxels(other, voxel_size) for other in before))
+    return len(here - known) / max(len(here), 1)
+
+
+def _voxels(thing: Thing, voxel_size: float) -> set[tuple[int, ...]]:
+    return set(map(tuple, np.unique(np.floor(thing.points / voxel_size).astype(int), axis=0).tolist()))
+
+
+def _worst(
+    frames: Sequence[DepthFrame],
+    views: dict[int, View],
+    aligned: dict[int, Thing],
+    poses: dict[int, Float[np.ndarray, "4 4"]],
+    settings: LearnerSettings,
+) -> tuple[int | None, str]:
+    """The view that fits the others least, if it must go, and why."""
+    if len(aligned) < 2:
+        return None, ""
+    shift = {k: _correction(frames[k], poses[k], aligned[k])[0] for k in aligned}
+    far = max(shift, key=lambda k: shift[k])
+    if shift[far] > settings.max_shift:
+        return far, (
+            f"its camera pose is {1e3 * shift[far]:.0f} mm off at the object, "
+            f"expected at most {1e3 * settings.max_shift:.0f}"
+        )
+    through = {
+        k: float(np.mean([_seen_through(aligned[k], frames[j], poses[j]) for j in aligned if j != k])) for k in aligned
+    }
+    wrong = max(through, key=lambda k: through[k])
+    if len(aligned) > 2 and through[wrong] > _CONTRADICTED:
+        return wrong, f"other views see through {through[wrong]:.0%} of its points: its camera pose must be wrong"
+    return None, ""
+
+
+def _seen_through(thing: Thing, frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"]) -> float:
+    """Share of a thing's points that this frame sees something far behind."""
+    T = np.linalg.inv(T_table_camera)
+    uv, z = project(thing.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
+    u, v = np.rint(uv).astype(int).T
+    inside = (z > 0) & (u >= 0) & (u < frame.intrinsics.width) & (v >= 0) & (v < frame.intrinsics.height)
+    with np.errstate(invalid="ignore"):
+        return float((frame.depth[v[inside], u[inside]] > z[inside] + _BEHIND).sum() / len(z))
+
+
+def _correction(frame: DepthFrame, pose: Float[np.ndarray, "4 4"], thing: Thing) -> tuple[float, float]:
+    """How far a pose was moved at the object (metres), and turned (radians)."""
+    assert frame.T_table_camera is not None
+    change = pose @ np.linalg.inv(frame.T_table_camera)
+    middle = np.append(thing.middle, 0.0)
+    back = np.linalg.inv(change)
+    shift = back[:3, :3] @ middle + back[:3, 3] - middle
+    return float(np.linalg.norm(shift)), float(Rotation.from_matrix(change[:3, :3]).magnitude())
+
+
+def _model(
+    name: str, fused: Fused, reports: tuple[ViewReport, ...], settings: LearnerSettings
+) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
+    """The model, in the object's own frame, with an upright box; and that frame's pose on the table."""
+    axes, size, middle = _upright_box(fused.hull)
+    base = np.array([*middle, 0.0])
+    hull = trimesh.convex.convex_hull(fused.hull - base)
+    solid = fused.solid._replace(origin=fused.solid.origin - base)
+    T_object_box = np.eye(4)
+    T_object_box[:3, :3] = axes
+    T_object_box[2, 3] = size[2] / 2
+    normals = contact_normals(hull, axes, solid.centre_of_mass)
+    normals[5] = [0.0, 0.0, -1.0]  # it stood so
+    heights = (normals @ hull.vertices.T).max(1)
+    heights[5] = 0.0
+    told = [asdict(report) for report in reports]
+    counts = np.bincount(fused.views, minlength=len(reports) + 1)
+    model = ObjectModel(
+        name=name,
+        **solid._asdict(),
+        T_object_box=T_object_box,
+        box_size=size,
+        contact_normal=normals,
+        contact_height=heights,
+        provenance={
+            "kind": "views",
+            "views": told,
+            "surface_voxels_by_views": counts.tolist(),
+            "settings": asdict(settings),
+        },
+        surface_views=fused.views,
+    )
+    T_table_object = np.eye(4)
+    T_table_object[:3, 3] = base
+    return model, T_table_object
+
+
+def _upright_box(
+    hull: Float[np.ndarray, "H 3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], Float[np.ndarray, "2"]]:
+    """Axes, size and the base's middle of the smallest upright box, its x within 45 degrees of the table's."""
+    to_box, _ = trimesh.bounds.oriented_bounds_2D(hull[:, :2])
+    angle = -np.arctan2(to_box[1, 0], to_box[0, 0])
+    angle = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    c, s = np.cos(angle), np.sin(angle)
+    axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    along = hull @ axes
+    low, high = along.min(0), along.max(0)
+    low[2] = 0.0
+    return axes, high - low, axes[:2, :2] @ ((low[:2] + high[:2]) / 2)

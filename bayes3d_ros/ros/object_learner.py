@@ -1,0 +1,290 @@
+"""The object_learner node: captures views of an unknown object, and builds a model of it that scene_parser can use."""
+
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from bayes3d_ros.captures import CaptureError, CaptureStore
+from bayes3d_ros.inference.object_learning import (
+    MOST_VIEWS,
+    Learned,
+    LearningError,
+    check_name,
+    choose_thing,
+    learn,
+    new_share,
+)
+from bayes3d_ros.inference.settings import LearnerSettings
+from bayes3d_ros.inference.view_segmentation import Thing, ViewError, segment
+from bayes3d_ros.model.objects import save_model
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
+from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
+from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, why_no_input
+from bayes3d_ros.ros.parameters import OBJECT_LEARNER_SETTINGS, ObjectLearnerNodeSettings, SettingsParameters
+from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.summary import key_values
+
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_INPUTS = ("qos_reliability", "table_frame", "camera_pose", "patience")
+
+
+_Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+
+
+class Refusal(Exception):
+    """Why a service did not do what it was asked for; one line."""
+
+
+class ObjectLearnerNode(Node):
+    """Services ~/capture, ~/build and ~/reset. What was captured is on disk, so that a node that was killed goes on
+    where it was."""
+
+    def __init__(self) -> None:
+        super().__init__("object_learner")
+        self._settings = SettingsParameters(self, OBJECT_LEARNER_SETTINGS)
+        self._inputs: DepthInputs | None = None
+        self._newest: DepthMessages | None = None
+        self._seen: dict[int, Thing] = {}  # what the captures of `_seen_of` show, by stamp
+        self._seen_of: Path | None = None
+        self._last = ""
+        self._model = self.create_publisher(PointCloud2, "~/model", _LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        for name, action in (("capture", self._capture), ("build", self._build), ("reset", self._reset)):
+            self.create_service(Trigger, f"~/{name}", self._answer(name, action))
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.add_post_set_parameters_callback(self._after_set_parameters)
+        self._open_inputs()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
+        self.create_timer(0.05, self._tick, clock=steady)
+        self.create_timer(1.0, self._report, clock=steady)
+
+    def stop(self, timeout: float) -> bool:
+        """There is no thread to wait for."""
+        return True
+
+    # Services
+
+    def _answer(self, name: str, action: Callable[[], str]) -> _Service:
+        """A service that says what was done, or in one line why not; it never takes the node down."""
+
+        def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = True, action()
+            except (Refusal, LearningError, CaptureError, ViewError) as error:
+                response.success, response.message = False, str(error)
+            except OSError as error:
+                why = f"{error.filename or 'disk'}: {error.strerror or error}"
+                response.success, response.message = False, f"cannot write: {why}"
+            except Exception as error:
+                told = " ".join(str(error).split())
+                response.success, response.message = False, f"internal error, please report it: {told}"
+                self.get_logger().debug(traceback.format_exc())
+            self._last = f"{name}: {response.message}"
+            if response.success:
+                self.get_logger().info(self._last)
+            else:
+                self.get_logger().warning(self._last)
+            return response
+
+        return answer
+
+    def _capture(self) -> str:
+        store, settings = self._store(), self._read(LearnerSettings)
+        seen = self._captured(store, settings)
+        if len(seen) >= MOST_VIEWS:
+            raise Refusal(f"{len(seen)} views are captured already, more would not be used: build or reset")
+        frame = self._newest_frame()
+        if frame.stamp_ns in seen:
+            raise Refusal(f"the newest image (stamp {frame.stamp_ns}) is captured already: move the camera, or wait")
+        view = segment(frame, settings)
+        if seen:
+            there = np.mean([thing.middle for thing in seen.values()], 0)
+            thing = min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
+        else:
+            thing = choose_thing(view, settings)
+        fresh = new_share(thing, list(seen.values()), settings.voxel_size)
+        store.add(frame)
+        seen[frame.stamp_ns] = thing
+        others = len(view.things) - 1
+        beside = f", {others} other thing{'s' * (others > 1)} left out" if others else ""
+        return (
+            f"view {len(seen)} of {store.folder.name}: {len(thing.points)} points on the object, "
+            f"{fresh:.0%} of its surface not seen before{beside}"
+        )
+
+    def _build(self) -> str:
+        store, settings = self._store(), self._read(LearnerSettings)
+        frames, problems = store.load()
+        if not frames:
+            raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
+        learned = learn(frames[:MOST_VIEWS], store.folder.name, settings)
+        path = save_model(learned.model, self._library())
+        self._publish(learned, frames[-1].stamp_ns)
+        used = sum(not view.refused for view in learned.views)
+        size = " x ".join(f"{v:.3f}" for v in learned.model.box_size)
+        refused = [f"view {k} left out: {v.refused}" for k, v in enumerate(learned.views, 1) if v.refused]
+        off = max((view.shift for view in learned.views if not view.refused), default=0.0)
+        done = (
+            f"{path}: {used} views, {size} m, {learned.coverage:.0%} of the surface seen, "
+            f"camera poses corrected by up to {1e3 * off:.0f} mm"
+        )
+        return "; ".join([done, *refused, *problems])
+
+    def _reset(self) -> str:
+        store = self._store()
+        count = store.clear()
+        self._seen_of = None
+        return f"{count} captures of {store.folder.name} deleted"
+
+    # What they need
+
+    def _read(self, kind: type) -> LearnerSettings:
+        try:
+            return self._settings.read(kind)
+        except ValueError as error:
+            raise Refusal(str(error)) from None
+
+    def _node_settings(self) -> ObjectLearnerNodeSettings:
+        try:
+            return self._settings.read(ObjectLearnerNodeSettings)
+        except ValueError as error:
+            raise Refusal(str(error)) from None
+
+    def _library(self) -> Path:
+        library = self._node_settings().library
+        if not library:
+            raise Refusal("parameter library is not set: expected a folder for object models")
+        return Path(library).expanduser()
+
+    def _store(self) -> CaptureStore:
+        name = self._node_settings().object_name
+        if not name:
+            raise Refusal("parameter object_name is not set: expected what to call the object")
+        try:
+            check_name(name)
+        except LearningError as error:
+            raise Refusal(f"parameter object_{error}") from None
+        return CaptureStore(self._library() / "captures" / name)
+
+    def _captured(self, store: CaptureStore, settings: LearnerSettings) -> dict[int, Thing]:
+        """What is captured of this object; after a restart, or of another object, read from the disk."""
+        if self._seen_of != store.folder:
+            frames, problems = store.load()
+            for problem in problems:
+                self.get_logger().warning(problem)
+            self._seen = {}
+            for frame in frames:
+                try:
+                    self._seen[frame.stamp_ns] = segment(frame, settings).things[0]
+                except ViewError as error:
+                    self.get_logger().warning(f"capture {frame.stamp_ns}: {error}")
+            self._seen_of = store.folder
+        return self._seen
+
+    def _newest_frame(self) -> DepthFrame:
+        settings, messages = self._node_settings(), self._newest
+        assert self._inputs is not None
+        if messages is None:
+            raise Refusal(why_no_input(self._inputs.view()) or "no image with its CameraInfo has come yet")
+        age = time.monotonic() - messages.arrived
+        if age > settings.max_age:
+            why = why_no_input(self._inputs.view())
+            raise Refusal(f"the newest image came {age:.1f} s ago" + (f": {why}" if why else ""))
+        try:
+            return frame_from_messages(messages.image, messages.info, messages.T_table_camera)
+        except ValueError as error:
+            raise Refusal(str(error)) from None
+
+    def _publish(self, learned: Learned, stamp_ns: int) -> None:
+        """The model's surface where it stood, in table_frame."""
+        model = learned.model
+        fields = [(name, np.float32) for name in ("x", "y", "z", "nx", "ny", "nz")]
+        rows = np.zeros(len(model.surface_index), [*fields, ("views", np.int32)])
+        for k, axis in enumerate("xyz"):
+            rows[axis] = (model.surface_points + learned.T_table_object[:3, 3])[:, k]
+            rows[f"n{axis}"] = model.surface_normal[:, k]
+        rows["views"] = model.surface_views
+        frame = self._node_settings().table_frame
+        self._model.publish(cloud_message(rows, Header(stamp=ns_to_stamp(stamp_ns), frame_id=frame)))
+
+    # Inputs and parameters
+
+    def _open_inputs(self) -> None:
+        try:
+            settings = self._settings.read(ObjectLearnerNodeSettings)
+        except ValueError as error:
+            self.get_logger().error(str(error))
+            settings = ObjectLearnerNodeSettings()
+        self._inputs = DepthInputs(
+            self,
+            self._keep,
+            reliability=settings.qos_reliability,
+            table_frame=settings.table_frame,
+            fixed_pose=settings.camera_pose,
+            use_pose=True,
+            patience=settings.patience,
+        )
+
+    def _keep(self, messages: DepthMessages) -> None:
+        self._newest = messages
+
+    def _tick(self) -> None:
+        if self._inputs is not None:
+            self._inputs.tick()
+
+    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        return self._settings.check(parameters)
+
+    def _after_set_parameters(self, parameters: list[Parameter]) -> None:
+        if self._inputs is not None and any(p.name in _INPUTS for p in parameters):
+            self._inputs.close()
+            self._newest = None
+            self._open_inputs()
+        self._seen_of = None
+
+    # Diagnostics
+
+    def _report(self) -> None:
+        assert self._inputs is not None
+        level, message = OK, "ready to capture"
+        if self._settings.problems:
+            level, message = ERROR, "; ".join(self._settings.problems.values())
+        elif why := why_no_input(self._inputs.view()):
+            level, message = WARN, why
+        elif self._newest is not None and self._newest.T_table_camera is None:
+            level, message = WARN, "no camera pose for the newest image (camera_pose topic, tf or parameter)"
+        name = f"{self.get_fully_qualified_name()}: object learning"
+        status = DiagnosticStatus(name=name, level=level, message=message, hardware_id="none")
+        status.values = key_values(
+            newest_stamp="" if self._newest is None else str(stamp_to_ns(self._newest.image.header.stamp)),
+            received=str(self._inputs.received),
+            dropped=str(self._inputs.dropped),
+            notes=self._inputs.notes(),
+            last=self._last,
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = Clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(ObjectLearnerNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

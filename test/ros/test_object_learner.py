@@ -1,0 +1,143 @@
+"""object_learner as a process of its own: capture, build, reset, refusals, and a kill in between."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from bayes3d_ros.bags import read_frames
+from bayes3d_ros.model.objects import load_library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros import conversions
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LEARNER = "/object_learner: object learning"
+
+
+class Rig:
+    """A learner, and a camera with poses."""
+
+    def __init__(self, ros, folder: Path, **parameters) -> None:
+        self.ros, self.library = ros, folder
+        self.camera = ros.camera()
+        self._poses = ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
+        self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+        self.start(**parameters)
+
+    def start(self, **parameters) -> None:
+        pairs = {"library": self.library, "object_name": "thing", "patience": 3.0, "max_age": 60.0, **parameters}
+        words = [word for name, value in pairs.items() for word in ("-p", f"{name}:={value}")]
+        self.process = self.ros.start("-m", "bayes3d_ros.ros.object_learner", "--ros-args", *words)
+        self.camera.wait_for_subscriber()
+        self.ros.wait_for(self._poses.get_subscription_count, "a subscriber of camera_pose")
+
+    def show(self, frame: DepthFrame) -> None:
+        """Publish a frame, with its pose where it has one, until it has come: after a kill, topics seem to have a
+        subscriber long before they have one again."""
+        header = Header(stamp=conversions.ns_to_stamp(frame.stamp_ns), frame_id="table")
+        published = -np.inf
+
+        def arrived() -> bool:
+            nonlocal published
+            if time.monotonic() - published > 2.0:
+                published = time.monotonic()
+                if frame.T_table_camera is not None:
+                    pose = conversions.matrix_to_pose(frame.T_table_camera)
+                    self._poses.publish(PoseStamped(header=header, pose=pose))
+                self.camera.publish(frame)
+            told = [report.status[0] for report in self.diagnostics if report.status[0].name == LEARNER]
+            pairs = [(pair.key, pair.value) for status in told for pair in status.values]
+            return ("newest stamp", str(frame.stamp_ns)) in pairs
+
+        self.ros.wait_for(arrived, "the image to be received")
+
+    def call(self, service: str) -> Trigger.Response:
+        return self.ros.call(Trigger, f"/object_learner/{service}", Trigger.Request())
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[DepthFrame]:
+    return list(read_frames(share_directory() / "bags" / "views_mustard_bottle"))
+
+
+@pytest.fixture
+def rig(ros, tmp_path: Path) -> Iterator[Rig]:
+    yield Rig(ros, tmp_path / "library", voxel_size=0.005)
+
+
+def test_a_model_is_learned_across_a_kill(ros, rig: Rig, frames) -> None:
+    models = ros.listen(PointCloud2, "/object_learner/model", LATCHED)
+    answer = rig.call("build")
+    assert not answer.success and answer.message == "nothing is captured yet: call ~/capture first"
+    for k in (0, 2):
+        rig.show(frames[k])
+        answer = rig.call("capture")
+        assert answer.success, answer.message
+        assert f"view {k // 2 + 1} of thing: " in answer.message and "points on the object" in answer.message
+    again = rig.call("capture")
+    assert not again.success and "is captured already" in again.message
+    ros.kill(rig.process)
+
+    rig.start(voxel_size=0.005)
+    rig.show(frames[4])
+    answer = rig.call("capture")
+    assert answer.success and "view 3 of thing: " in answer.message
+    answer = rig.call("build")
+    assert answer.success, answer.message
+    (model,) = load_library(rig.library).models
+    assert model.name == "thing" and len(model.provenance["views"]) == 3
+    np.testing.assert_allclose(np.sort(model.box_size), (0.06, 0.10, 0.19), atol=0.012)
+    ros.wait_for(lambda: models, "the model")
+    rows = conversions.rows_from_cloud(models[0])
+    assert models[0].header.frame_id == "table"
+    assert conversions.stamp_to_ns(models[0].header.stamp) == frames[4].stamp_ns
+    assert len(rows) == len(model.surface_index) and rows["z"].max() == pytest.approx(0.19, abs=0.01)
+    answer = rig.call("reset")
+    assert answer.success and answer.message == "3 captures of thing deleted"
+    assert not rig.call("build").success
+    assert rig.process.stop() == 0, rig.process.output()
+
+
+def test_refusals_are_one_line_each(ros, rig: Rig, frames) -> None:
+    answer = rig.call("capture")
+    assert not answer.success and "no message yet on /depth/image_rect" in answer.message
+    rig.show(DepthFrame(frames[0].depth, frames[0].intrinsics, 5, "camera", None))
+    answer = rig.call("capture")
+    assert not answer.success and answer.message == "no camera pose for this view, a learner needs one"
+    scene = next(iter(read_frames(share_directory() / "bags" / "three_objects")))
+    rig.show(scene)
+    answer = rig.call("capture")
+    assert not answer.success and answer.message.startswith("3 things stand in the workspace")
+    table = next(iter(read_frames(share_directory() / "bags" / "empty_table")))
+    rig.show(replace(table, stamp_ns=table.stamp_ns + 1))
+    answer = rig.call("capture")
+    assert not answer.success and answer.message.startswith("nothing stands on the table inside the workspace")
+    assert not list(rig.library.rglob("*.npz"))
+    assert rig.process.stop() == 0, rig.process.output()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"object_name": "../up"}, "parameter object_name: expected letters, digits, '_' and '-', got '../up'"),
+        ({"object_name": "''"}, "parameter object_name is not set: expected what to call the object"),
+        ({"library": "''"}, "parameter library is not set: expected a folder for object models"),
+        ({"library": "/proc/nowhere"}, "/proc/nowhere"),
+    ],
+)
+def test_wrong_parameters(ros, tmp_path: Path, frames, parameters, message) -> None:
+    rig = Rig(ros, tmp_path / "library", **parameters)
+    rig.show(frames[0])
+    answer = rig.call("capture")
+    assert not answer.success and message in answer.message and "\n" not in answer.message
+    assert rig.process.stop() == 0, rig.process.output()
