@@ -42,9 +42,10 @@ from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pa
 _GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
 _MODES = 8
 _FIT = (24, 3)  # draws a mode, rounds
-_LOOSE = (0.012, 0.012, 0.15)  # metres, metres, radians: how far off alignment may be where no surface holds it
+_LOOSE = (0.012, 0.012, 0.3)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _BEHIND = 1e6  # nats
+_REPEATED = 4.0  # nats
 _WIDE = 120  # pixels across: the search sees smaller images whole, wider ones at half their resolution
 _BLUR = 0.002  # metres: candidates are scored at this sigma at least, or those a pixel beside the peak score as misses
 _WORTH = 5.0  # nats: below, no candidate is worth a search
@@ -100,12 +101,15 @@ def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, flo
 
 
 def _apart(contact: Contact, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
-    """Scores, with all but the `most` best of any place set behind the others: what is seen best must not crowd out
-    what stands elsewhere. Sorted by falling score beforehand."""
+    """Scores, with all but the `most` best of any place set behind the others, and those of a type there lowered by
+    `_REPEATED` for each that is better: what is seen best must crowd out neither what stands elsewhere nor another type
+    of a few percent. Sorted by falling score beforehand."""
     apart = jnp.hypot(contact.x[:, None] - contact.x, contact.y[:, None] - contact.y)
     close = apart < library.radius[contact.type]
-    before = jnp.tril(close & jnp.isfinite(score), -1).sum(1)
-    return jnp.where(before < most, score, score - _BEHIND)
+    before = jnp.tril(close & jnp.isfinite(score), -1)
+    same = before & (contact.type[:, None] == contact.type)
+    score = score - _REPEATED * same.sum(1)
+    return jnp.where(before.sum(1) < most, score, score - _BEHIND)
 
 
 def candidates(
