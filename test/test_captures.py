@@ -13,6 +13,7 @@ import pytest
 
 from bayes3d_ros.captures import CaptureError, CaptureStore
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.model.objects import load_library
 from bayes3d_ros.model.observation import DepthFrame
 
 
@@ -64,7 +65,7 @@ def test_a_disk_that_is_full_costs_this_capture_only(tmp_path: Path) -> None:
     assert len(store.load()[0]) == 1
 
 
-WRITER = """
+CAPTURES = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
@@ -75,23 +76,48 @@ for k in range(10_000):
     store.add(frame(k, (320, 240)))
     print(k, flush=True)
 """
+MODELS = """
+import sys
+from pathlib import Path
+import trimesh
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import save_model
+models = [model_from_mesh(trimesh.creation.box((0.1, 0.1, 0.1 + 0.02 * k)), "mug", 0.004) for k in range(2)]
+for k in range(10_000):
+    save_model(models[k % 2], Path(sys.argv[2]))
+    print(k, flush=True)
+"""
+
+
+def killed(program: str, folder: Path, chance: random.Random) -> int:
+    """How many files a program said that it had written before it was killed, somewhere in the next."""
+    command = [sys.executable, "-c", program, str(Path(__file__).parent), str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = [process.stdout.readline() for _ in range(3)]
+        deadline = time.monotonic() + chance.uniform(0, 0.05)
+        while time.monotonic() < deadline:
+            pass
+        process.send_signal(signal.SIGKILL)
+        said += process.stdout.readlines()
+    return sum(line.endswith("\n") for line in said)
 
 
 def test_a_kill_leaves_only_whole_captures(tmp_path: Path) -> None:
     chance = random.Random(0)
     for trial in range(3):
         folder = tmp_path / str(trial)
-        command = [sys.executable, "-c", WRITER, str(Path(__file__).parent), str(folder)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            said = [process.stdout.readline() for _ in range(3)]
-            deadline = time.monotonic() + chance.uniform(0, 0.05)
-            while time.monotonic() < deadline:
-                pass
-            process.send_signal(signal.SIGKILL)
-            said += process.stdout.readlines()
+        written = killed(CAPTURES, folder, chance)
         frames, problems = CaptureStore(folder).load()
-        assert not problems
-        assert len(frames) >= len([line for line in said if line.endswith("\n")]) >= 3
+        assert not problems and len(frames) >= written >= 3
         CaptureStore(folder).clear()
         assert not list(folder.iterdir())
+
+
+def test_a_kill_leaves_only_whole_models(tmp_path: Path) -> None:
+    chance = random.Random(1)
+    for trial in range(3):
+        folder = tmp_path / str(trial)
+        assert killed(MODELS, folder, chance) >= 3
+        (model,) = load_library(folder).models
+        assert model.name == "mug"

@@ -112,16 +112,16 @@ def choose_things(views: dict[int, View], settings: LearnerSettings) -> dict[int
     """In every view the thing to learn: as `cluster` says in the first, in the others the one that stands there."""
     chosen: dict[int, Thing] = {}
     for k, view in views.items():
-        if chosen:
-            there = np.mean([thing.middle for thing in chosen.values()], 0)
-            chosen[k] = min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
-        else:
-            chosen[k] = choose_thing(view, settings)
+        chosen[k] = choose_thing(view, list(chosen.values()), settings)
     return chosen
 
 
-def choose_thing(view: View, settings: LearnerSettings) -> Thing:
-    """The thing to learn of those in a view. Raises LearningError where there are several and `cluster` is "only"."""
+def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings) -> Thing:
+    """The thing to learn of those in a view, given what was chosen in the views before. Raises LearningError where
+    there are several to begin with and `cluster` is "only"."""
+    if before:
+        there = np.mean([thing.middle for thing in before], 0)
+        return min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
     if settings.cluster == "central":
         middle = np.array([settings.workspace_x, settings.workspace_y])
         return min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - middle)))

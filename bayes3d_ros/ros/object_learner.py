@@ -111,11 +111,7 @@ class ObjectLearnerNode(Node):
         if frame.stamp_ns in seen:
             raise Refusal(f"the newest image (stamp {frame.stamp_ns}) is captured already: move the camera, or wait")
         view = segment(frame, settings)
-        if seen:
-            there = np.mean([thing.middle for thing in seen.values()], 0)
-            thing = min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
-        else:
-            thing = choose_thing(view, settings)
+        thing = choose_thing(view, list(seen.values()), settings)
         fresh = new_share(thing, list(seen.values()), settings.voxel_size)
         store.add(frame)
         seen[frame.stamp_ns] = thing
@@ -189,8 +185,9 @@ class ObjectLearnerNode(Node):
             self._seen = {}
             for frame in frames:
                 try:
-                    self._seen[frame.stamp_ns] = segment(frame, settings).things[0]
-                except ViewError as error:
+                    thing = choose_thing(segment(frame, settings), list(self._seen.values()), settings)
+                    self._seen[frame.stamp_ns] = thing
+                except (ViewError, LearningError) as error:
                     self.get_logger().warning(f"capture {frame.stamp_ns}: {error}")
             self._seen_of = store.folder
         return self._seen
@@ -267,10 +264,13 @@ class ObjectLearnerNode(Node):
             level, message = WARN, why
         elif self._newest is not None and self._newest.T_table_camera is None:
             level, message = WARN, "no camera pose for the newest image (camera_pose topic, tf or parameter)"
+        stamp = "none" if self._newest is None else str(stamp_to_ns(self._newest.image.header.stamp))
+        if self._newest is not None and self._newest.T_table_camera is None:
+            stamp += ", without a camera pose"
         name = f"{self.get_fully_qualified_name()}: object learning"
         status = DiagnosticStatus(name=name, level=level, message=message, hardware_id="none")
         status.values = key_values(
-            newest_stamp="" if self._newest is None else str(stamp_to_ns(self._newest.image.header.stamp)),
+            newest_stamp=stamp,
             received=str(self._inputs.received),
             dropped=str(self._inputs.dropped),
             notes=self._inputs.notes(),

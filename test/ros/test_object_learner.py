@@ -35,7 +35,7 @@ class Rig:
         self.start(**parameters)
 
     def start(self, **parameters) -> None:
-        pairs = {"library": self.library, "object_name": "thing", "patience": 3.0, "max_age": 60.0, **parameters}
+        pairs = {"library": self.library, "object_name": "thing", "patience": 2.0, "max_age": 60.0, **parameters}
         words = [word for name, value in pairs.items() for word in ("-p", f"{name}:={value}")]
         self.process = self.ros.start("-m", "bayes3d_ros.ros.object_learner", "--ros-args", *words)
         self.camera.wait_for_subscriber()
@@ -49,7 +49,7 @@ class Rig:
 
         def arrived() -> bool:
             nonlocal published
-            if time.monotonic() - published > 2.0:
+            if time.monotonic() - published > 6.0:  # longer than `patience`: a newer image overtakes one that waits
                 published = time.monotonic()
                 if frame.T_table_camera is not None:
                     pose = conversions.matrix_to_pose(frame.T_table_camera)
@@ -57,7 +57,8 @@ class Rig:
                 self.camera.publish(frame)
             told = [report.status[0] for report in self.diagnostics if report.status[0].name == LEARNER]
             pairs = [(pair.key, pair.value) for status in told for pair in status.values]
-            return ("newest stamp", str(frame.stamp_ns)) in pairs
+            posed = "" if frame.T_table_camera is not None else ", without a camera pose"
+            return ("newest stamp", f"{frame.stamp_ns}{posed}") in pairs
 
         self.ros.wait_for(arrived, "the image to be received")
 
