@@ -123,7 +123,7 @@ def test_one_bad_depth_image_is_outvoted(exact, bracket):
     """A bump of 2 cm that one view sees on the object, and a blob that hangs in the air."""
     frames = list(exact.frames)
     depth = frames[0].depth.copy()
-    depth[230:250, 310:330] -= 0.02
+    depth[250:270, 280:300] -= 0.02
     depth[100:130, 300:330] = 0.45
     frames[0] = replace(frames[0], depth=depth)
     found = learn(frames, "bracket", SETTINGS)

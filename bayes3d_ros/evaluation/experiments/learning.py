@@ -174,9 +174,9 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
     titles = {
-        "median": "median distance of the model from the surface, mm",
-        "covered": "share of the seen surface that it covers",
-        "add_s": "ADD-S in a scene parsed with it, mm (gaps: not found)",
+        "median": "model's median distance from the surface, mm",
+        "covered": "share of the seen surface covered",
+        "add_s": "ADD-S in a scene (gaps: not found), mm",
     }
     for axis, (key, title) in zip(axes, titles.items(), strict=True):
         for k, name in enumerate(PLACES):
