@@ -1,11 +1,12 @@
 """Learn a voxel model of an unknown object from a few calibrated depth views of it on the table."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import project
@@ -54,13 +55,10 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
     check_name(name)
     if not 1 <= len(frames) <= MOST_VIEWS:
         raise LearningError(f"expected 1 to {MOST_VIEWS} views, got {len(frames)}")
-    views: dict[int, View] = {}
-    refused: dict[int, str] = {}
-    for k, frame in enumerate(frames):
-        try:
-            views[k] = segment(frame, settings)
-        except ViewError as error:
-            refused[k] = str(error)
+    with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
+        parts = list(pool.map(lambda frame: _segmented(frame, settings), frames))
+    views = {k: part for k, part in enumerate(parts) if isinstance(part, View)}
+    refused = {k: part for k, part in enumerate(parts) if isinstance(part, str)}
     things = choose_things(views, settings)
     while True:
         if not things:
@@ -87,6 +85,14 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
     )
     model, T_table_object = _model(name, fused, reports, settings)
     return Learned(model, T_table_object, reports, float((fused.views > 0).mean()))
+
+
+def _segmented(frame: DepthFrame, settings: LearnerSettings) -> View | str:
+    """The view, or why there is none."""
+    try:
+        return segment(frame, settings)
+    except ViewError as error:
+        return str(error)
 
 
 def check_name(name: str) -> None:
@@ -137,12 +143,14 @@ def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings)
 def new_share(thing: Thing, before: Sequence[Thing], voxel_size: float) -> float:
     """Share of the voxels that a view sees of an object which none of the views before it saw."""
     here = _voxels(thing, voxel_size)
-    known: set[tuple[int, ...]] = set().union(*(_voxels(other, voxel_size) for other in before))
-    return len(here - known) / max(len(here), 1)
+    known = np.concatenate([np.zeros(0, np.int64), *(_voxels(other, voxel_size) for other in before)])
+    return float((~np.isin(here, known)).mean())
 
 
-def _voxels(thing: Thing, voxel_size: float) -> set[tuple[int, ...]]:
-    return set(map(tuple, np.unique(np.floor(thing.points / voxel_size).astype(int), axis=0).tolist()))
+def _voxels(thing: Thing, voxel_size: float) -> Int[np.ndarray, "V"]:
+    """Numbers of the voxels that hold its points: 21 bits for each coordinate."""
+    cell = np.floor(thing.points / voxel_size).astype(np.int64) + 2**20
+    return np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2])
 
 
 def _worst(

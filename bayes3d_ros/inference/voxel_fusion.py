@@ -91,7 +91,9 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     # Where noise was dropped the plane next door decides; behind it is solid.
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     hull = _hull(points)
-    solid = _pieces(seen | behind | (_within(hull, centres).reshape(grid.shape) & (hits + glimpses == 0)))
+    unknown = hits + glimpses == 0
+    unknown[unknown] = _within(hull, centres[unknown.ravel()])
+    solid = _pieces(seen | behind | unknown)
     unseen = _unseen_surface(solid, seen)
     counts = np.concatenate([hits[tuple(voxel.T)], np.zeros(len(unseen.voxel), int)])
     voxel = np.concatenate([voxel, unseen.voxel])

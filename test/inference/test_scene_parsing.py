@@ -83,7 +83,9 @@ def test_two_objects_are_found(parser, library, pose):
     assert SIGMA / 1.2 < result.sigma < SIGMA * 1.2
     assert set(np.unique(result.segmentation)) == {0, 1, 2}
     seen = result.segmentation > 0
-    assert np.abs(result.reconstruction - observed.depth)[seen].mean() < 2 * SIGMA
+    miss = np.abs(result.reconstruction - observed.depth)[seen]
+    # Of a mean, pixels along the outlines, one object's depth against another's, would be the larger part.
+    assert np.median(miss) < SIGMA and (miss < 4 * SIGMA).mean() > 0.95
 
 
 def test_empty_table_has_no_object(parser, library):
