@@ -33,13 +33,14 @@ class GroundTruth:
         self._always: list[TrueObject] | None = None
         try:
             content = json.loads(self._file.read_text())
+            self.pose_noise = bool(content.get("pose_noise"))  # whether the camera poses are wrong on purpose
             if "frames" in content:
                 self._frames = {f["stamp_ns"]: [_simulated(o) for o in f["objects"]] for f in content["frames"]}
             elif "object" in content:
                 self._always = [TrueObject(content["object"], _pose(content["T_camera_object"]), 1.0)]
             else:
                 self._always = [TrueObject(str(name), None, None) for name in content["objects"]]
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise BagError(f"{self._file}: expected frames, object or objects ({error!r})") from None
 
     def at(self, stamp_ns: int) -> list[TrueObject]:

@@ -77,6 +77,8 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
         "poses": "4x4, metres, of the frame of the mesh; T_a_b takes b-coordinates to a",
         "frames": truth,
     }
+    if any(scene.pose_noise):
+        record["pose_noise"] = list(scene.pose_noise)  # metres, radians: the bag's camera poses are wrong by this
     (out / "ground_truth.json").write_text(json.dumps(record, indent=1) + "\n")
     return out
 

@@ -21,7 +21,7 @@ _REACH = (0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.02, 0.012, 0.012, 0.012, 0
 _SAME_SIDE = 0.6  # cosine between normals of partners: the two sides of a wall are none
 _RIM = 16, 0.4  # neighbours; share of their mean distance by which their middle is off at the rim of a surface
 _SPACING = 0.002  # metres between the points that others look for partners in
-_MOST = 500  # points of a view that look for partners
+_MOST = 700  # points of a view that look for partners
 
 
 class Shift(NamedTuple):

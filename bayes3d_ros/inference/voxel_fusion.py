@@ -90,7 +90,8 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     seen[tuple(voxel.T)] = True
     # Where noise was dropped the plane next door decides; behind it is solid.
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
-    hull = _hull(points)
+    centre = grid.origin + (voxel + 0.5) * voxel_size
+    hull = _hull(centre + patches.normal[~noise] * patches.offset[~noise, None])  # points would count with their noise
     unknown = hits + glimpses == 0
     unknown[unknown] = _within(hull, centres[unknown.ravel()])
     solid = _pieces(seen | behind | unknown)
