@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.evaluation.correlated_errors import draw_correlated_errors
 from bayes3d_ros.evaluation.ray_casting import RayCaster, Rendering, SimulationError
-from bayes3d_ros.evaluation.resting import resting_normals, turn
+from bayes3d_ros.evaluation.resting import placed, resting_normals, turn
 from bayes3d_ros.evaluation.scene_file import look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import Intrinsics, project
@@ -99,14 +99,9 @@ def random_noise(rng: np.random.Generator) -> SensorNoise:
 
 def _put(thing: RestingObject, rest: int, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
     """T_table_object: at rest, its middle at a random place, turned by a random yaw."""
-    pose = np.eye(4)
     yaw = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
-    pose[:3, :3] = yaw @ turn(thing.downs[rest], np.array([0.0, 0.0, -1.0]))
-    placed = thing.mesh.vertices @ pose[:3, :3].T
-    low, high = placed.min(0), placed.max(0)
-    pose[:2, 3] = rng.uniform(-PLACES, PLACES, 2) - (low[:2] + high[:2]) / 2
-    pose[2, 3] = -low[2]
-    return pose
+    rotation = yaw @ turn(thing.downs[rest], np.array([0.0, 0.0, -1.0]))
+    return placed(thing.mesh, rotation, rng.uniform(-PLACES, PLACES, 2))
 
 
 def _view(

@@ -48,6 +48,19 @@ def rest_rotation(mesh: trimesh.Trimesh, rest: str) -> Float[np.ndarray, "3 3"]:
     return turn(normals[best], np.array([0.0, 0.0, -1.0]))
 
 
+def placed(
+    mesh: trimesh.Trimesh, rotation: Float[np.ndarray, "3 3"], middle: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "4 4"]:
+    """T_table_mesh of a mesh turned so, lowered to the table, its bounding box's middle at x, y."""
+    vertices = mesh.vertices @ rotation.T
+    low, high = vertices.min(0), vertices.max(0)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:2, 3] = middle - (low[:2] + high[:2]) / 2
+    pose[2, 3] = -low[2]
+    return pose
+
+
 def turn(source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes one unit vector to another."""
     axis, cosine = np.cross(source, target), float(source @ target)

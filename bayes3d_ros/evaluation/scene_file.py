@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.evaluation.ray_casting import SimulationError
-from bayes3d_ros.evaluation.resting import rest_rotation
+from bayes3d_ros.evaluation.resting import placed, rest_rotation
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise
 from bayes3d_ros.geometry.camera import Intrinsics
 
@@ -175,12 +175,8 @@ def _object(entry: Any, where: str, folder: Path) -> SceneObject:
     except ValueError as error:
         raise ValueError(f"{where}.{error}") from None
     yaw = _number(given.get("yaw", 0), f"{where}.yaw")
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation
-    placed = mesh.vertices @ pose[:3, :3].T
-    low, high = placed.min(0), placed.max(0)
-    centre = _number(given.get("x", 0), f"{where}.x"), _number(given.get("y", 0), f"{where}.y")
-    pose[:3, 3] = [centre[0] - (low[0] + high[0]) / 2, centre[1] - (low[1] + high[1]) / 2, -low[2]]
+    middle = np.array([_number(given.get(axis, 0), f"{where}.{axis}") for axis in ("x", "y")])
+    pose = placed(mesh, Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation, middle)
     name = given.get("name", Path(source).stem)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{where}.name: expected a text, got {name!r}")

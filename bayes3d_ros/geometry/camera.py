@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,15 @@ def project(
     z = points[..., 2]
     uv = points[..., :2] / z[..., None] * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
     return uv, z
+
+
+def nearest_pixels(
+    points: Float[np.ndarray, "N 3"], intrinsics: Intrinsics
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"], Float[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
+    """Column, row and depth z of points in the camera frame, and which of them are in view."""
+    uv, z = project(points, intrinsics)
+    u, v = np.rint(uv).astype(int).T
+    return u, v, z, (z > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
 
 
 def resize_depth(

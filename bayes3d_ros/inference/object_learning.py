@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.camera import project
+from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.inference.settings import LearnerSettings
 from bayes3d_ros.inference.view_alignment import align_views, moved
 from bayes3d_ros.inference.view_segmentation import Thing, View, ViewError, segment
@@ -182,9 +182,7 @@ def _worst(
 def _seen_through(thing: Thing, frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"]) -> float:
     """Share of a thing's points that this frame sees something far behind."""
     T = np.linalg.inv(T_table_camera)
-    uv, z = project(thing.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
-    u, v = np.rint(uv).astype(int).T
-    inside = (z > 0) & (u >= 0) & (u < frame.intrinsics.width) & (v >= 0) & (v < frame.intrinsics.height)
+    u, v, z, inside = nearest_pixels(thing.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
     with np.errstate(invalid="ignore"):
         return float((frame.depth[v[inside], u[inside]] > z[inside] + _BEHIND).sum() / len(z))
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from bayes3d_ros.geometry.camera import project
+from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
 from bayes3d_ros.inference.view_segmentation import Thing
@@ -130,14 +130,11 @@ def _passed(
     low = centres[:, 2] < _LOW
     at = np.where(low[:, None], centres * [1, 1, 0], centres)  # of the lowest what counts is the table under them
     T = np.linalg.inv(T_table_camera)
-    uv, z = project(at @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
+    u, v, z, inside = nearest_pixels(at @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
     depth = np.where(frame.depth > 0, frame.depth, 0.0)  # NaN: no return says nothing
     # The whole of a voxel, from any side.
     width = np.sqrt(3) * voxel_size * frame.intrinsics.fx / max(float(np.median(z)), 1e-3)
     nearest = ndimage.minimum_filter(depth, 2 * int(np.ceil(width / 2)) + 1)
-    u, v = np.rint(uv).astype(int).T
-    height, width_px = depth.shape
-    inside = (z > 0) & (u >= 0) & (u < width_px) & (v >= 0) & (v < height)
     around, middle = np.zeros(len(z)), np.zeros(len(z))
     around[inside], middle[inside] = nearest[v[inside], u[inside]], depth[v[inside], u[inside]]
     all_through = around > z + np.where(low, -_BEHIND, np.sqrt(3) / 2 * voxel_size + _BEHIND)

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.evaluation.benchmark import ycb_mesh
 from bayes3d_ros.evaluation.capture_views import capture, shape_errors
 from bayes3d_ros.evaluation.experiments import Row
-from bayes3d_ros.evaluation.experiments.parsing import Surfaces
+from bayes3d_ros.evaluation.experiments.parsing import Surfaces, estimated_pose
 from bayes3d_ros.evaluation.metrics import add_s
 from bayes3d_ros.evaluation.plots import INK, colour
 from bayes3d_ros.evaluation.random_scenes import CAMERA, RestingObject, resting_object
 from bayes3d_ros.evaluation.ray_casting import Box, RayCaster
-from bayes3d_ros.evaluation.resting import rest_rotation
+from bayes3d_ros.evaluation.resting import placed, rest_rotation
 from bayes3d_ros.evaluation.scene_file import look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.mesh import load_mesh
@@ -91,12 +91,8 @@ def _thing(name: str) -> RestingObject:
 
 def _pose(thing: RestingObject, x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
     """T_table_object of the upright mesh, its bounding box's middle at x, y."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rest_rotation(thing.mesh, "upright")
-    placed = thing.mesh.vertices @ pose[:3, :3].T
-    low, high = placed.min(0), placed.max(0)
-    pose[:3, 3] = [x - (low[0] + high[0]) / 2, y - (low[1] + high[1]) / 2, -low[2]]
-    return pose
+    rotation = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rest_rotation(thing.mesh, "upright")
+    return placed(thing.mesh, rotation, np.array([x, y]))
 
 
 def _scene(things: dict[str, RestingObject]) -> DepthFrame:
@@ -127,9 +123,8 @@ def _parse(
         found = []
         for estimate in posterior.objects:
             if estimate.type == name:
-                T = np.eye(4)
-                T[:3, :3], T[:3, 3] = Rotation.from_quat(estimate.orientation).as_matrix(), estimate.position
-                found.append((add_s(surfaces(name), T_true, T @ models[name][1]), estimate.type_probabilities[name]))
+                T = estimated_pose(estimate) @ models[name][1]
+                found.append((add_s(surfaces(name), T_true, T), estimate.type_probabilities[name]))
         row["found"] = bool(found)
         row["add_s"], row["type_probability"] = (round(float(v), 6) for v in min(found)) if found else (None, None)
         row["listed"] = len(posterior.objects)

@@ -165,7 +165,7 @@ def failed_rows(where: Row, true: Sequence[TrueObject], error: str) -> list[Row]
 def _partners(true: Sequence[TrueObject], estimates: Sequence[ObjectEstimate], library: Library) -> dict[int, int]:
     """Index of the estimate that stands for a true object, of the same type."""
     box = {model.name: model.T_object_box[:3, 3] for model in library.models}
-    here = np.array([_pose(e)[:3, :3] @ box[e.type] + e.position for e in estimates]).reshape(-1, 3)
+    here = np.array([estimated_pose(e)[:3, :3] @ box[e.type] + e.position for e in estimates]).reshape(-1, 3)
     there = np.zeros((len(true), 3))
     for i, thing in enumerate(true):
         if thing.T_camera_object is None:
@@ -186,7 +186,7 @@ def _object_row(
     if estimate is not None:
         row |= _sureness(estimate)
         if thing.T_camera_object is not None:
-            pose, truth = _pose(estimate), thing.T_camera_object
+            pose, truth = estimated_pose(estimate), thing.T_camera_object
             error, covariance = truth[:3, 3] - estimate.position, np.asarray(estimate.covariance[:3, :3], float)
             outside, distance = distance_outside(error, covariance, REGION)
             row["add_s"] = round(add_s(surfaces(thing.type), truth, pose), 7)
@@ -206,7 +206,8 @@ def _sureness(estimate: ObjectEstimate) -> Row:
     }
 
 
-def _pose(estimate: ObjectEstimate) -> Float[np.ndarray, "4 4"]:
+def estimated_pose(estimate: ObjectEstimate) -> Float[np.ndarray, "4 4"]:
+    """T_camera_object."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(estimate.orientation).as_matrix()
     pose[:3, 3] = estimate.position
