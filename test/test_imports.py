@@ -20,7 +20,8 @@ TOP_LEVEL = {
     "mcap_files": (),
     "bags": ("geometry", "model", "mcap_files"),
     "captures": ("geometry", "model"),
-    "cli": (*LAYERS, "bags", "mcap_files", "resources"),
+    "command_errors": ("geometry", "model", "inference", "evaluation", "mcap_files"),
+    "cli": (*LAYERS, "bags", "command_errors", "mcap_files", "resources"),
 }
 ROS_PACKAGES = {
     *("rclpy", "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "std_msgs", "std_srvs", "geometry_msgs"),
