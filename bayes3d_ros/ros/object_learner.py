@@ -34,7 +34,7 @@ from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, why_no_input
-from bayes3d_ros.ros.parameters import OBJECT_LEARNER_SETTINGS, ObjectLearnerNodeSettings, SettingsParameters
+from bayes3d_ros.ros.parameters import OBJECT_LEARNER_SETTINGS, ObjectLearnerNodeSettings, Settings, SettingsParameters
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.summary import key_values
 
@@ -148,17 +148,14 @@ class ObjectLearnerNode(Node):
 
     # What they need
 
-    def _read(self, kind: type) -> LearnerSettings:
+    def _read(self, kind: type[Settings]) -> Settings:
         try:
             return self._settings.read(kind)
         except ValueError as error:
             raise Refusal(str(error)) from None
 
     def _node_settings(self) -> ObjectLearnerNodeSettings:
-        try:
-            return self._settings.read(ObjectLearnerNodeSettings)
-        except ValueError as error:
-            raise Refusal(str(error)) from None
+        return self._read(ObjectLearnerNodeSettings)
 
     def _library(self) -> Path:
         library = self._node_settings().library
