@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.mixture import Modes, draw_modes, log_density_modes, refit
 from bayes3d_ros.inference.resampling import effective_fraction
@@ -19,7 +19,8 @@ _PILOT_ROUNDS, PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
 FINALISTS = 4
 COMPONENTS = FINALISTS * (1 + ALIKE)
 _INFLATION, _FLATTEN = 1.5, 4.0
-_TRUST = 0.5  # in the pilots' word on a mode's mass: they are few
+# In the pilots' word on masses, which rests on few of them: of the modes of a type, and of the types.
+_TRUST, _TRUST_TYPES = 0.5, 0.3
 _EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find
 _PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
 _SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
@@ -165,7 +166,7 @@ def adapt(
         # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
         component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)
         mass = jax.nn.logsumexp(component + log_weight[:, None], 0)
-        share = jnp.logaddexp(jax.nn.log_softmax(_TRUST * mass), jnp.log(0.03 / len(mass)))
+        share = jnp.logaddexp(log_shares(mass, modes.centre.type), jnp.log(0.03 / len(mass)))
         fitted = refit(draws, weight, modes)._replace(log_weight=jax.nn.log_softmax(share))
         return fitted, Pilots(draws, log_target, log_drawn), effective_fraction(log_weight)
 
@@ -181,6 +182,18 @@ def adapt(
     none_yet = Pilots(draw_modes(key, modes, PILOT_DRAWS), unknown, unknown)
     _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (0, modes, none_yet, jnp.float32(0.0)))
     return modes, pilots
+
+
+def log_shares(mass: Float[Array, "M"], kind: Int[Array, "M"]) -> Float[Array, "M"]:
+    """Log shares of draws for modes of these log masses and types: flatter than the masses, and flatter yet between
+    types. However many modes the likely type has, another of a few percent is drawn often enough to be weighed."""
+    same = kind[:, None] == kind
+    mass = jnp.maximum(mass, mass.max() - 1e4)  # a type of which no pilot was drawn
+
+    def of_type(value: Float[Array, "M"]) -> Float[Array, "M"]:
+        return jax.nn.logsumexp(jnp.where(same, value, -jnp.inf), 1)
+
+    return jax.nn.log_softmax(_TRUST_TYPES * of_type(mass) + _TRUST * mass - of_type(_TRUST * mass))
 
 
 def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
