@@ -92,6 +92,7 @@ class Extended(NamedTuple):
     log_likelihood: Float[Array, "N"]
     log_q: Float[Array, "N"]  # of the new object
     log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
+    line: Int[Array, "N"]  # which draw from q the new object descends from, by copies and small moves
 
 
 def move_new(

@@ -33,6 +33,7 @@ class Scenes(NamedTuple):
 
     objects: Contact  # [N, M]
     alone: Float[Array, "N M"]  # nats that each object alone gains over the empty table
+    line: Int[Array, "N M"]  # which draw of its stage an object descends from; moves here do not change it
     scenes: Float[Array, "N Hp Wp"]  # padded depth
     table: Float[Array, "N S P"]
     log_likelihood: Float[Array, "N"]
@@ -161,4 +162,4 @@ def _move(
     end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, start)
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
     scenes = draw_objects(end.new, without[end.ancestor], *context, window)
-    return Scenes(objects, end.alone, scenes, end.table, end.log_likelihood, log_weight)
+    return Scenes(objects, end.alone, state.line[end.ancestor], scenes, end.table, end.log_likelihood, log_weight)

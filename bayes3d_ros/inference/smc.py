@@ -35,6 +35,7 @@ class State(NamedTuple):
 
     objects: Contact  # [N, M]
     alone: Float[Array, "N M"]  # nats that each object alone gains over the empty table
+    line: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
     scenes: Float[Array, "N Hp Wp"]  # padded depth
     table: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
     log_likelihood: Float[Array, "N"]  # noise integrated out
@@ -66,6 +67,7 @@ def init(
     return State(
         objects=Contact(none, none, zero, zero, zero),
         alone=zero,
+        line=none,
         scenes=everywhere(empty.scene),
         table=everywhere(empty.table),
         log_likelihood=everywhere(empty.log_likelihood),
@@ -113,7 +115,8 @@ def step(
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
-        return Extended(ancestor, new, summed, log_likelihood, log_q, jnp.where(clash, -jnp.inf, log_ratio))
+        log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
+        return Extended(ancestor, new, summed, log_likelihood, log_q, log_ratio, jnp.arange(particles))
 
     start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
     end, log_weight, log_evidence, ess = _anneal(
@@ -128,11 +131,13 @@ def step(
     log_weight, last = normalised(log_weight + log_last(alone, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
+    line = state.line[end.ancestor].at[:, count].set(end.line)
     scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
     proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
     return State(
         objects=objects,
         alone=alone,
+        line=line,
         scenes=scenes,
         table=end.table,
         log_likelihood=end.log_likelihood,
@@ -155,7 +160,7 @@ def refresh(
     effort: Effort,
 ) -> State:
     """The same posterior of scenes of `count` objects, some of them moved."""
-    scenes = Scenes(state.objects, state.alone, state.scenes, state.table, state.log_likelihood, state.log_weight)
+    scenes = Scenes(*(getattr(state, name) for name in Scenes._fields))
     frame = Frame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
@@ -180,7 +185,9 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
 
         def move(number: Array, extended: Extended) -> Extended:
             move_key, kind = jax.random.fold_in(level_key, number), (level + number) % 3
-            return move_new(move_key, extended, c, kind, extend, proposal, context.library, context.table)
+            moved = move_new(move_key, extended, c, kind, extend, proposal, context.library, context.table)
+            fresh = (kind == 2) & (moved.new.x != extended.new.x)
+            return moved._replace(line=jnp.where(fresh, moved.line + (level + 1) * len(fresh), extended.line))
 
         moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
         extended = jax.lax.fori_loop(0, moves, move, extended)

@@ -48,7 +48,7 @@ class Run(NamedTuple):
     log_evidence: tuple[float, ...]  # of 0, 1, .. objects
     contact: Contact  # [N, k], scenes of the most objects
     weight: Float[np.ndarray, "N"]  # sums to one
-    ess: float  # of those, not divided by N; copies of an object count once, the slot with the fewest counts
+    ess: float  # of those, not divided by N; what descends from one draw counts once; of the slot with the fewest
 
 
 def run(problem: Problem, seed: int, particles: int = PARTICLES, step: Callable = smc.step) -> Run:
@@ -66,7 +66,8 @@ def run(problem: Problem, seed: int, particles: int = PARTICLES, step: Callable 
         log_evidence.append(float(state.log_evidence))
     weight = np.exp(np.asarray(state.log_weight, np.float64))
     contact: Contact = jax.tree.map(lambda a: np.asarray(a)[:, :objects], state.objects)
-    ess = min(effective_size(weight, [np.asarray(a)[:, k] for a in contact]) for k in range(objects))
+    line = np.asarray(state.line)
+    ess = min(effective_size(weight, [line[:, k]]) for k in range(objects))
     return Run(tuple(log_evidence), contact, weight / weight.sum(), ess)
 
 
