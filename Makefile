@@ -1,5 +1,6 @@
 # make setup   a virtual environment in .venv with everything in it (demo, test, lint and colcon do it first)
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
+# make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
 # make test    all tests;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
@@ -17,7 +18,7 @@ COLCON_TESTS :=
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint colcon clean
+.PHONY: help setup demo demo-learn test lint colcon clean
 help:
 	@sed -n 's/^# \(make\)/\1/p' Makefile
 
@@ -40,6 +41,13 @@ $(STAMP): setup.py pyproject.toml setup.cfg Makefile tools/find_python.sh
 
 demo: setup
 	$(BIN)/bayes3d demo --out $(OUT)
+
+LEARNED := mug mustard_bottle cracker_box
+demo-learn: setup
+	for name in $(LEARNED); do \
+	    $(BIN)/bayes3d learn bags/views_$$name --name $$name --library $(OUT)-learn/library || exit; \
+	done
+	$(BIN)/bayes3d parse bags/three_objects --library $(OUT)-learn/library --out $(OUT)-learn/parsed
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
