@@ -109,9 +109,7 @@ def _table_size(settings: ParserSettings) -> tuple[float, float]:
 def render(objects: Contact, number: int, problem: Problem) -> Float[np.ndarray, "H W"]:
     """Depth of the first `number` of objects [M] on the table, as the sampler draws it."""
     half, (height, width) = problem.settings.window // 2, problem.blank.depth.shape
-    padded = _render(
-        objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window
-    )
+    padded = _render(objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window)
     return np.asarray(padded)[half : half + height, half : half + width]
 
 

@@ -10,9 +10,7 @@ _WITHIN = 0.02  # of the depth: returns of one surface
 _FEWEST = 3  # returns that make a surface
 
 
-def consensus(
-    depth: Float[Array, "H W"], kind: Int[Array, "H W"]
-) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
+def consensus(depth: Float[Array, "H W"], kind: Int[Array, "H W"]) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
     """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
     where fewer than three agree."""
     height, width = depth.shape

@@ -157,9 +157,7 @@ class SceneParser:
             raise ParseError("no camera pose for this frame, and table:=pose expects one")
         return table_frame(find_plane(points), points), ["table found in the depth image"]
 
-    def _sample(
-        self, key: PRNGKeyArray, context: Context, grid: NoiseGrid
-    ) -> tuple[list[_Stage], list[float]]:
+    def _sample(self, key: PRNGKeyArray, context: Context, grid: NoiseGrid) -> tuple[list[_Stage], list[float]]:
         """Stages of the sampler, from the empty table to more objects than the image bears out."""
         settings = self.settings
         fixed = settings.fixed_objects >= 0
@@ -211,9 +209,7 @@ class SceneParser:
             return state
         key = jax.random.fold_in(key, 2000 + count)
         effort = Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating))
-        return smc.refresh(
-            key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort
-        )
+        return smc.refresh(key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort)
 
     def _keep(
         self, key: PRNGKeyArray, state: smc.State, context: Context, grid: NoiseGrid, matters: bool = True
@@ -274,9 +270,7 @@ class SceneParser:
         )
         return samples, float(log_evidence)
 
-    def _poses(
-        self, objects: Contact, table: Table, plane: Float[np.ndarray, "S 3"]
-    ) -> Float[np.ndarray, "S M 4 4"]:
+    def _poses(self, objects: Contact, table: Table, plane: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S M 4 4"]:
         """T_camera_object in float64 numpy: sample counts differ from frame to frame, and must not recompile."""
         T_contact = np.asarray(self._arrays.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
         slide = np.zeros((*objects.type.shape, 4, 4))

@@ -75,9 +75,7 @@ class ParserSettings:
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.3, "resample below this fraction of effective particles", low=0.0, high=1.0)
-    rejuvenation: int = setting(
-        1, "objects of a finished scene that are moved again given the others", low=0, high=100
-    )
+    rejuvenation: int = setting(1, "objects of a finished scene that are moved again given the others", low=0, high=100)
     reheating: int = setting(
         0, "steps by which their posterior is flattened meanwhile, to get from peak to peak", low=0, high=20
     )
@@ -102,9 +100,7 @@ class LearnerSettings:
     workspace_y: float = setting(0.0, "middle of the workspace, along y of the table frame", unit="m")
     workspace_width: float = setting(1.0, "extent of the workspace along x", unit="m", low=0.05, high=10.0)
     workspace_depth: float = setting(1.0, "extent of the workspace along y", unit="m", low=0.05, high=10.0)
-    workspace_height: float = setting(
-        0.5, "returns higher above the table are left out", unit="m", low=0.02, high=10.0
-    )
+    workspace_height: float = setting(0.5, "returns higher above the table are left out", unit="m", low=0.02, high=10.0)
     near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
     far: float = setting(3.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
     gap: float = setting(0.02, "things that stand this far apart are several", unit="m", low=0.002, high=1.0)

@@ -66,9 +66,7 @@ def log_prior(contact: Contact, library: LibraryArrays, table: Table) -> Float[A
     return jnp.where(inside, log_p, -jnp.inf)
 
 
-def overlap(
-    a: Contact, b: Contact, library: LibraryArrays
-) -> Float[Array, "*batch"]:
+def overlap(a: Contact, b: Contact, library: LibraryArrays) -> Float[Array, "*batch"]:
     """How much two solids interpenetrate: of points spread in one the share that lies in the other, the larger way."""
     T_a, T_b = T_table_object(a, library), T_table_object(b, library)
     return jnp.maximum(_share_inside(a, T_a, b, T_b, library), _share_inside(b, T_b, a, T_a, library))

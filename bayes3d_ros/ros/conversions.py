@@ -33,9 +33,7 @@ def ns_to_stamp(ns: int) -> Time:
 
 def depth_from_image(image: Image) -> Float[np.ndarray, "height width"]:
     """Metres, NaN where there is no return. ValueError with one line naming the field that is wrong."""
-    return decode_depth(
-        image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian)
-    )
+    return decode_depth(image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian))
 
 
 def intrinsics_from_message(info: CameraInfo, image: Image) -> Intrinsics:

@@ -54,9 +54,7 @@ class Run(NamedTuple):
 def run(problem: Problem, seed: int, particles: int = PARTICLES, step: Callable = smc.step) -> Run:
     """As many stages as the problem has true objects. All that is asked of the sampler stands here."""
     objects, key = len(problem.truth.type), jax.random.key(seed)
-    state = smc.init(
-        problem.context, problem.grid, particles, problem.max_objects, problem.table_size, problem.window
-    )
+    state = smc.init(problem.context, problem.grid, particles, problem.max_objects, problem.table_size, problem.window)
     log_evidence = [0.0]
     for count in range(objects):
         state, _ = step(

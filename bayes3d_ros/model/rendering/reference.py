@@ -21,9 +21,7 @@ def render(
     surface = np.zeros(model.occupancy.shape, bool)
     surface[tuple(model.surface_index.T)] = True
     interior = np.argwhere(model.occupancy & ~surface) + 0.5
-    return np.array(
-        [min(_surface_hit(model, eye, d, near), _interior_hit(interior, eye, d, near)) for d in directions]
-    )
+    return np.array([min(_surface_hit(model, eye, d, near), _interior_hit(interior, eye, d, near)) for d in directions])
 
 
 def _cube(centres: np.ndarray, eye: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
