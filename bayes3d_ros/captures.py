@@ -36,7 +36,7 @@ class CaptureStore:
             self.folder.mkdir(parents=True, exist_ok=True)
             handle, temporary = tempfile.mkstemp(prefix=".capture-", suffix=".tmp", dir=self.folder)
             with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
+                np.savez(  # as it is: compressing took several times as long as the disk
                     file,
                     depth=np.asarray(frame.depth, np.float32),
                     intrinsics=np.array([i.fx, i.fy, i.cx, i.cy]),

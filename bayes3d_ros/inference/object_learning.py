@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.inference.settings import LearnerSettings
 from bayes3d_ros.inference.view_alignment import align_views, moved
-from bayes3d_ros.inference.view_segmentation import Thing, View, ViewError, segment
+from bayes3d_ros.inference.view_segmentation import Surface, Thing, View, ViewError, middle, segment, surface
 from bayes3d_ros.inference.voxel_fusion import Fused, FusionError, Seen, fuse
 from bayes3d_ros.model.mesh_import import contact_normals
 from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel
@@ -57,22 +57,24 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
         raise LearningError(f"expected 1 to {MOST_VIEWS} views, got {len(frames)}")
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
         parts = list(pool.map(lambda frame: _segmented(frame, settings), frames))
-    views = {k: part for k, part in enumerate(parts) if isinstance(part, View)}
-    refused = {k: part for k, part in enumerate(parts) if isinstance(part, str)}
-    things = choose_things(views, settings)
+        views = {k: part for k, part in enumerate(parts) if isinstance(part, View)}
+        refused = {k: part for k, part in enumerate(parts) if isinstance(part, str)}
+        things = choose_things(views, settings)
+        oriented = pool.map(lambda k: surface(views[k], things[k]), things)
+        surfaces = dict(zip(things, oriented, strict=True))
     while True:
-        if not things:
+        if not surfaces:
             reasons = "; ".join(f"view {k + 1}: {why}" for k, why in sorted(refused.items()))
             raise LearningError(f"none of {len(frames)} views can be used: {reasons}")
-        used = sorted(things)
-        shifts = dict(zip(used, align_views([things[k] for k in used]), strict=True))
-        aligned = {k: moved(things[k], shifts[k]) for k in used}
+        used = sorted(surfaces)
+        shifts = dict(zip(used, align_views([surfaces[k] for k in used]), strict=True))
+        aligned = {k: moved(surfaces[k], shifts[k]) for k in used}
         poses = {k: shifts[k].matrix() @ views[k].T_table_camera for k in used}
         worst, why = _worst(frames, views, aligned, poses, settings)
         if worst is None:
             break
         refused[worst] = why
-        del things[worst]
+        del surfaces[worst]
     try:
         fused = fuse([Seen(aligned[k], frames[k], poses[k]) for k in used], settings.voxel_size)
     except FusionError as error:
@@ -126,18 +128,20 @@ def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings)
     """The thing to learn of those in a view, given what was chosen in the views before. Raises LearningError where
     there are several to begin with and `cluster` is "only"."""
     if before:
-        there = np.mean([thing.middle for thing in before], 0)
-        return min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - there)))
+        return _nearest(view.things, np.mean([middle(thing.points) for thing in before], 0))
     if settings.cluster == "central":
-        middle = np.array([settings.workspace_x, settings.workspace_y])
-        return min(view.things, key=lambda thing: float(np.linalg.norm(thing.middle - middle)))
+        return _nearest(view.things, np.array([settings.workspace_x, settings.workspace_y]))
     if settings.cluster == "only" and len(view.things) > 1:
-        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in (thing.middle for thing in view.things))
+        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in (middle(thing.points) for thing in view.things))
         raise LearningError(
             f"{len(view.things)} things stand in the workspace, at x, y = {places} m: expected one, "
             "or cluster largest or central, or a smaller workspace"
         )
     return view.things[0]
+
+
+def _nearest(things: Sequence[Thing], place: Float[np.ndarray, "2"]) -> Thing:
+    return min(things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - place)))
 
 
 def new_share(thing: Thing, before: Sequence[Thing], voxel_size: float) -> float:
@@ -156,7 +160,7 @@ def _voxels(thing: Thing, voxel_size: float) -> Int[np.ndarray, "V"]:
 def _worst(
     frames: Sequence[DepthFrame],
     views: dict[int, View],
-    aligned: dict[int, Thing],
+    aligned: dict[int, Surface],
     poses: dict[int, Float[np.ndarray, "4 4"]],
     settings: LearnerSettings,
 ) -> tuple[int | None, str]:
@@ -179,21 +183,21 @@ def _worst(
     return None, ""
 
 
-def _seen_through(thing: Thing, frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"]) -> float:
+def _seen_through(surface: Surface, frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"]) -> float:
     """Share of a thing's points that this frame sees something far behind."""
     T = np.linalg.inv(T_table_camera)
-    u, v, z, inside = nearest_pixels(thing.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
+    u, v, z, inside = nearest_pixels(surface.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
     with np.errstate(invalid="ignore"):
         return float((frame.depth[v[inside], u[inside]] > z[inside] + _BEHIND).sum() / len(z))
 
 
-def _correction(frame: DepthFrame, pose: Float[np.ndarray, "4 4"], thing: Thing) -> tuple[float, float]:
+def _correction(frame: DepthFrame, pose: Float[np.ndarray, "4 4"], surface: Surface) -> tuple[float, float]:
     """How far a pose was moved at the object (metres), and turned (radians)."""
     assert frame.T_table_camera is not None
     change = pose @ np.linalg.inv(frame.T_table_camera)
-    middle = np.append(thing.middle, 0.0)
+    place = np.append(middle(surface.points), 0.0)
     back = np.linalg.inv(change)
-    shift = back[:3, :3] @ middle + back[:3, 3] - middle
+    shift = back[:3, :3] @ place + back[:3, 3] - place
     return float(np.linalg.norm(shift)), float(Rotation.from_matrix(change[:3, :3]).magnitude())
 
 
@@ -201,8 +205,8 @@ def _model(
     name: str, fused: Fused, reports: tuple[ViewReport, ...], settings: LearnerSettings
 ) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
     """The model, in the object's own frame, with an upright box; and that frame's pose on the table."""
-    axes, size, middle = _upright_box(fused.hull)
-    base = np.array([*middle, 0.0])
+    axes, size, place = _upright_box(fused.hull)
+    base = np.array([*place, 0.0])
     hull = trimesh.convex.convex_hull(fused.hull - base)
     solid = fused.solid._replace(origin=fused.solid.origin - base)
     T_object_box = np.eye(4)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from bayes3d_ros.inference.view_segmentation import Thing
+from bayes3d_ros.inference.view_segmentation import Surface, middle
 
 _PRIOR = 0.015, 0.015, np.deg2rad(0.8)  # standard deviations of a pose's error at the object: metres, metres, radians
 _NOISE = 0.002  # metres, of a point against a surface of another view
@@ -44,17 +44,17 @@ class Shift(NamedTuple):
 class _Cloud(NamedTuple):
     """A view as it was given, to be looked for partners in."""
 
-    thing: Thing
+    surface: Surface
     tree: cKDTree
     rim: Bool[np.ndarray, "N"]  # where the surface seen ends: who finds no better partner may belong beyond
     some: Int[np.ndarray, "K"]
 
 
-def align_views(things: list[Thing]) -> list[Shift]:
+def align_views(surfaces: list[Surface]) -> list[Shift]:
     """For every view of one object the motion that makes it fit the others best. Means stay nearly where they were."""
-    count = len(things)
-    about = np.mean([thing.middle for thing in things], 0)
-    clouds = [_cloud(_thinned(thing)) for thing in things]
+    count = len(surfaces)
+    about = np.mean([middle(surface.points) for surface in surfaces], 0)
+    clouds = [_cloud(_thinned(surface)) for surface in surfaces]
     found = np.zeros((count, 3))
     prior = np.tile(1 / np.square(_PRIOR), count)
     for reach in _REACH if count > 1 else ():
@@ -83,15 +83,15 @@ def _between(
     """Signed distances of points of one view from planes of the other, and their slopes in both motions."""
     T, T_other = here.matrix(), there.matrix()
     back = np.linalg.inv(T_other) @ T
-    points, normals = cloud.thing.points[cloud.some], cloud.thing.normals[cloud.some]
+    points, normals = cloud.surface.points[cloud.some], cloud.surface.normals[cloud.some]
     distance, index = other.tree.query(points @ back[:3, :3].T + back[:3, 3], distance_upper_bound=reach)
     near = np.flatnonzero(np.isfinite(distance))
     near = near[~other.rim[index[near]]]
-    normal = other.thing.normals[index[near]] @ T_other[:3, :3].T
+    normal = other.surface.normals[index[near]] @ T_other[:3, :3].T
     facing = np.einsum("ni,ni->n", normals[near] @ T[:3, :3].T, normal) > _SAME_SIDE
     near, normal = near[facing], normal[facing]
     p = points[near] @ T[:3, :3].T + T[:3, 3]
-    q = other.thing.points[index[near]] @ T_other[:3, :3].T + T_other[:3, 3]
+    q = other.surface.points[index[near]] @ T_other[:3, :3].T + T_other[:3, 3]
     arm, arm_other = p[:, :2] - here.about - here[:2], q[:, :2] - there.about - there[:2]
     turn = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
     turn_other = arm_other[:, 0] * normal[:, 1] - arm_other[:, 1] * normal[:, 0]
@@ -99,24 +99,24 @@ def _between(
     return slope, np.einsum("ni,ni->n", normal, p - q)
 
 
-def moved(thing: Thing, shift: Shift) -> Thing:
+def moved(surface: Surface, shift: Shift) -> Surface:
     """A view's points after its correction."""
     T = shift.matrix()
-    return Thing(thing.points @ T[:3, :3].T + T[:3, 3], thing.normals @ T[:3, :3].T)
+    return Surface(surface.points @ T[:3, :3].T + T[:3, 3], surface.normals @ T[:3, :3].T)
 
 
-def _cloud(thing: Thing) -> _Cloud:
-    some = np.linspace(0, len(thing.points) - 1, min(_MOST, len(thing.points))).astype(int)
-    tree = cKDTree(thing.points)
+def _cloud(surface: Surface) -> _Cloud:
+    some = np.linspace(0, len(surface.points) - 1, min(_MOST, len(surface.points))).astype(int)
+    tree = cKDTree(surface.points)
     neighbours, share = _RIM
-    distance, index = tree.query(thing.points, min(neighbours, len(thing.points)))
-    off = np.linalg.norm(thing.points[index].mean(1) - thing.points, axis=1)
-    return _Cloud(thing, tree, off > share * distance.mean(1), some)
+    distance, index = tree.query(surface.points, min(neighbours, len(surface.points)))
+    off = np.linalg.norm(surface.points[index].mean(1) - surface.points, axis=1)
+    return _Cloud(surface, tree, off > share * distance.mean(1), some)
 
 
-def _thinned(thing: Thing) -> Thing:
+def _thinned(surface: Surface) -> Surface:
     """One point in each cube of `_SPACING`."""
-    cell = np.floor(thing.points / _SPACING).astype(int)
+    cell = np.floor(surface.points / _SPACING).astype(int)
     cell -= cell.min(0)
     _, first = np.unique(np.ravel_multi_index(tuple(cell.T), cell.max(0) + 1), return_index=True)
-    return Thing(thing.points[first], thing.normals[first])
+    return Surface(surface.points[first], surface.normals[first])

@@ -29,13 +29,14 @@ class Thing(NamedTuple):
     """One of the things that stand on the table, as far as this view shows it."""
 
     points: Float[np.ndarray, "N 3"]  # table frame
-    normals: Float[np.ndarray, "N 3"]  # towards the camera
+    pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]  # rows, columns
 
-    @property
-    def middle(self) -> Float[np.ndarray, "2"]:
-        """On the table, of its bounding rectangle."""
-        xy = self.points[:, :2]
-        return (xy.min(0) + xy.max(0)) / 2
+
+class Surface(NamedTuple):
+    """Of one thing, with the way it faces."""
+
+    points: Float[np.ndarray, "N 3"]  # table frame
+    normals: Float[np.ndarray, "N 3"]  # towards the camera
 
 
 class View(NamedTuple):
@@ -65,19 +66,50 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
     spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
     lowest = float(np.clip(3 * spread, *_LOWEST))
     risen = inside & (local[..., 2] > lowest) & _undisturbed(depth)
-    normals = _normals(points, risen, frame)
     labels = _things(local, risen, settings.gap)
     sizes = np.bincount(labels[risen], minlength=1)
-    foot = ndimage.minimum(local[..., 2], labels, np.arange(len(sizes)))
+    foot = np.full(len(sizes), np.inf)
+    np.minimum.at(foot, labels[risen], local[risen][:, 2])
     found = [k for k in np.argsort(-sizes) if k > 0 and sizes[k] >= _FEWEST and foot[k] < _STANDS]
     if not found:
         raise ViewError(
             f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
             f"{1e3 * lowest:.0f} mm above it, expected at least {_FEWEST} together)"
         )
-    rotation = T_table_camera[:3, :3]
-    things = [Thing(local[labels == k], normals[labels == k] @ rotation.T) for k in found]
-    return View(frame, T_table_camera, tuple(things))
+    pixels = [np.nonzero(labels == k) for k in found]
+    return View(frame, T_table_camera, tuple(Thing(local[where], where) for where in pixels))
+
+
+def surface(view: View, thing: Thing) -> Surface:
+    """With normals of planes fitted to what the thing shows around each of its pixels."""
+    distance = float(np.median(view.frame.depth[thing.pixels]))
+    side = 2 * int(np.clip(round(_NORMAL_RADIUS * view.frame.intrinsics.fx / distance), 2, 8)) + 1
+    rows, columns = thing.pixels
+    at = rows - rows.min(), columns - columns.min()
+    shape = at[0].max() + 1, at[1].max() + 1
+    mask = np.zeros(shape)
+    mask[at] = 1.0
+    p = np.zeros((*shape, 3))
+    p[at] = thing.points - thing.points.mean(0)
+
+    def mean_around(a: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return ndimage.uniform_filter(a, side, mode="constant")
+
+    number = mean_around(mask)[at]
+    first = np.stack([mean_around(p[..., i])[at] / number for i in range(3)], -1)
+    second = np.empty((len(rows), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            moment = mean_around(p[..., i] * p[..., j])[at] / number
+            second[:, i, j] = second[:, j, i] = moment - first[:, i] * first[:, j]
+    normals = np.linalg.eigh(second)[1][..., 0]
+    away = np.einsum("ni,ni->n", normals, thing.points - view.T_table_camera[:3, 3]) > 0
+    return Surface(thing.points, np.where(away[:, None], -normals, normals))
+
+
+def middle(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "2"]:
+    """On the table, of their bounding rectangle."""
+    return (points[:, :2].min(0) + points[:, :2].max(0)) / 2
 
 
 def _inside(local: Float[np.ndarray, "H W 3"], settings: LearnerSettings) -> Bool[np.ndarray, "H W"]:
@@ -144,42 +176,7 @@ def _undisturbed(depth: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         return np.isfinite(depth) & (high - low < _EDGE * depth) & (share > 0.75)
 
 
-def _normals(
-    points: Float[np.ndarray, "H W 3"], chosen: Bool[np.ndarray, "H W"], frame: DepthFrame
-) -> Float[np.ndarray, "H W 3"]:
-    """Of planes fitted to the chosen pixels around each of them, in the camera frame, towards the camera."""
-    normals = np.zeros(points.shape)
-    if not chosen.any():
-        return normals
-    distance = float(np.median(points[chosen][:, 2]))
-    side = 2 * int(np.clip(round(_NORMAL_RADIUS * frame.intrinsics.fx / distance), 2, 8)) + 1
-    rows, columns = (slice(max(a.min() - side, 0), a.max() + side + 1) for a in np.nonzero(chosen))
-    mask = chosen[rows, columns].astype(np.float64)
-    origin = points[chosen].mean(0)
-    p = np.where(mask[..., None] > 0, points[rows, columns] - origin, 0.0)
-
-    def mean_around(a: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        return ndimage.uniform_filter(a, side, mode="constant")
-
-    number = np.maximum(mean_around(mask), 1e-9)
-    first = np.stack([mean_around(p[..., i]) / number for i in range(3)], -1)
-    second = np.empty((*mask.shape, 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            moment = mean_around(p[..., i] * p[..., j]) / number
-            second[..., i, j] = second[..., j, i] = moment - first[..., i] * first[..., j]
-    at = chosen[rows, columns]
-    normal = np.linalg.eigh(second[at])[1][..., 0]
-    towards = np.einsum("ni,ni->n", normal, points[rows, columns][at]) < 0
-    part = np.zeros((*mask.shape, 3))
-    part[at] = np.where(towards[:, None], normal, -normal)
-    normals[rows, columns] = part
-    return normals
-
-
-def _things(
-    local: Float[np.ndarray, "H W 3"], risen: Bool[np.ndarray, "H W"], gap: float
-) -> Int[np.ndarray, "H W"]:
+def _things(local: Float[np.ndarray, "H W 3"], risen: Bool[np.ndarray, "H W"], gap: float) -> Int[np.ndarray, "H W"]:
     """Labels 1.. of what is connected seen from above, over gaps narrower than `gap`; 0 elsewhere."""
     labels = np.zeros(risen.shape, int)
     if not risen.any():

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
-from bayes3d_ros.inference.view_segmentation import Thing
+from bayes3d_ros.inference.view_segmentation import Surface
 from bayes3d_ros.model.observation import DepthFrame
 
 # Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.
@@ -63,22 +63,22 @@ class FusionError(Exception):
 class Seen(NamedTuple):
     """An object in one view: its points, and the whole depth image with the camera's pose."""
 
-    thing: Thing
+    surface: Surface
     frame: DepthFrame
     T_table_camera: Float[np.ndarray, "4 4"]
 
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
-    grid = _grid([view.thing for view in views], voxel_size)
+    grid = _grid([view.surface for view in views], voxel_size)
     centres = grid.centres()
-    hits = np.sum([_hits(view.thing, grid) for view in views], 0).reshape(grid.shape)
+    hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
     passes, glimpses = rays.reshape(2, *grid.shape)
     surface = _pieces((hits > 0) & (_HIT * hits - _GLIMPSE * glimpses - (_PASS - _GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
-    points, normals = (np.concatenate(part) for part in zip(*(view.thing for view in views), strict=True))
+    points, normals = (np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True))
     index = grid.voxel_of(points)
     kept = surface.ravel()[index]
     points, normals, index = points[kept], normals[kept], index[kept]
@@ -105,8 +105,8 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
 
 
-def _grid(things: Sequence[Thing], voxel_size: float) -> Grid:
-    points = np.concatenate([thing.points for thing in things])
+def _grid(surfaces: Sequence[Surface], voxel_size: float) -> Grid:
+    points = np.concatenate([surface.points for surface in surfaces])
     low, high = points.min(0), points.max(0)
     low[:2], high = low[:2] - voxel_size, high + voxel_size
     low[2] = -voxel_size / 2
@@ -117,9 +117,9 @@ def _grid(things: Sequence[Thing], voxel_size: float) -> Grid:
     return Grid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
 
 
-def _hits(thing: Thing, grid: Grid) -> Int[np.ndarray, "V"]:
+def _hits(surface: Surface, grid: Grid) -> Int[np.ndarray, "V"]:
     """1 for voxels that hold points of this view. A single one may be a stray."""
-    return (np.bincount(grid.voxel_of(thing.points), minlength=int(np.prod(grid.shape))) > 1).astype(int)
+    return (np.bincount(grid.voxel_of(surface.points), minlength=int(np.prod(grid.shape))) > 1).astype(int)
 
 
 def _passed(
