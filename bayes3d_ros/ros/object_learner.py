@@ -127,6 +127,7 @@ class ObjectLearnerNode(Node):
         frames, problems = store.load()
         if not frames:
             raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
+        self.get_logger().info(f"building {store.folder.name} from {len(frames)} view{'s' * (len(frames) != 1)}")
         learned = learn(frames[:MOST_VIEWS], store.folder.name, settings)
         path = save_model(learned.model, self._library())
         self._publish(learned, frames[-1].stamp_ns)

@@ -12,9 +12,11 @@ import pytest
 import rclpy
 import trimesh
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
@@ -71,12 +73,16 @@ class Ros:
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """A service's answer."""
-        client = self.node.create_client(kind, name)
-        self.wait_for(client.service_is_ready, f"service {name}")
-        future = client.call_async(request)
+        client, future = self.ask(kind, name, request)
         self.wait_for(future.done, f"the answer of {name}")
         self.node.destroy_client(client)
         return future.result()
+
+    def ask(self, kind: Any, name: str, request: Any) -> tuple[Client, Future]:
+        """Call a service without waiting for its answer."""
+        client = self.node.create_client(kind, name)
+        self.wait_for(client.service_is_ready, f"service {name}")
+        return client, client.call_async(request)
 
     def wait_for(self, done: Callable[[], Any], what: str, seconds: float = 30.0, pause: float = 0.05) -> Any:
         """Spin until `done` returns something true, and return it."""

@@ -259,5 +259,3 @@ def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> N
 
 def test_the_library_message_lists_names() -> None:
     assert conversions.library_message(("a", "b")).data == "a\nb"
-
-

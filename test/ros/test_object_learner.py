@@ -76,7 +76,7 @@ def rig(ros, tmp_path: Path) -> Iterator[Rig]:
     yield Rig(ros, tmp_path / "library", voxel_size=0.005)
 
 
-def test_a_model_is_learned_across_a_kill(ros, rig: Rig, frames) -> None:
+def test_a_model_is_learned_across_kills(ros, rig: Rig, frames) -> None:
     models = ros.listen(PointCloud2, "/object_learner/model", LATCHED)
     answer = rig.call("build")
     assert not answer.success and answer.message == "nothing is captured yet: call ~/capture first"
@@ -93,6 +93,14 @@ def test_a_model_is_learned_across_a_kill(ros, rig: Rig, frames) -> None:
     rig.show(frames[4])
     answer = rig.call("capture")
     assert answer.success and "view 3 of thing: " in answer.message
+    ros.ask(Trigger, "/object_learner/build", Trigger.Request())
+    ros.wait_for(lambda: "building thing from 3 views" in rig.process.output(), "the build to begin")
+    ros.kill(rig.process)
+    for name in rig.library.glob("*.npz"):
+        assert load_library(rig.library).names == (name.stem,)  # whole, or not there
+
+    rig.start(voxel_size=0.005)
+    rig.show(frames[6])  # when it has come, the services are those of the new process
     answer = rig.call("build")
     assert answer.success, answer.message
     (model,) = load_library(rig.library).models
