@@ -84,7 +84,8 @@ def _between(
     T, T_other = here.matrix(), there.matrix()
     back = np.linalg.inv(T_other) @ T
     points, normals = cloud.surface.points[cloud.some], cloud.surface.normals[cloud.some]
-    distance, index = other.tree.query(points @ back[:3, :3].T + back[:3, 3], distance_upper_bound=reach)
+    there_seen = points @ back[:3, :3].T + back[:3, 3]
+    distance, index = other.tree.query(there_seen, distance_upper_bound=reach, workers=-1)
     near = np.flatnonzero(np.isfinite(distance))
     near = near[~other.rim[index[near]]]
     normal = other.surface.normals[index[near]] @ T_other[:3, :3].T
@@ -109,7 +110,7 @@ def _cloud(surface: Surface) -> _Cloud:
     some = np.linspace(0, len(surface.points) - 1, min(_MOST, len(surface.points))).astype(int)
     tree = cKDTree(surface.points)
     neighbours, share = _RIM
-    distance, index = tree.query(surface.points, min(neighbours, len(surface.points)))
+    distance, index = tree.query(surface.points, min(neighbours, len(surface.points)), workers=-1)
     off = np.linalg.norm(surface.points[index].mean(1) - surface.points, axis=1)
     return _Cloud(surface, tree, off > share * distance.mean(1), some)
 

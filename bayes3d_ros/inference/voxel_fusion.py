@@ -92,8 +92,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (voxel + 0.5) * voxel_size
     hull = _hull(centre + patches.normal[~noise] * patches.offset[~noise, None])  # points would count with their noise
-    unknown = hits + glimpses == 0
-    unknown[unknown] = _within(hull, centres[unknown.ravel()])
+    unknown = (hits + glimpses == 0) & _within(hull, grid)
     solid = _pieces(seen | behind | unknown)
     unseen = _unseen_surface(solid, seen)
     counts = np.concatenate([hits[tuple(voxel.T)], np.zeros(len(unseen.voxel), int)])
@@ -179,12 +178,19 @@ def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
         raise FusionError(f"the points seen have no volume ({str(error).splitlines()[0][:80]})") from None
 
 
-def _within(hull: ConvexHull, points: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, "V"]:
-    inside = np.ones(len(points), bool)
-    for plane in hull.equations:  # one after the other: fewer and fewer are left
-        left = np.flatnonzero(inside)
-        inside[left] = points[left] @ plane[:3] + plane[3] <= 0
-    return inside
+def _within(hull: ConvexHull, grid: Grid) -> Bool[np.ndarray, "X Y Z"]:
+    """Voxels whose middles lie in the hull: between its highest and lowest plane of their column."""
+    x, y, z = (grid.origin[k] + (np.arange(grid.shape[k]) + 0.5) * grid.voxel_size for k in range(3))
+    low, high = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)
+    for plane in hull.equations:
+        outside = plane[0] * x[:, None] + plane[1] * y + plane[3]  # at z = 0, by so much
+        if abs(plane[2]) < 1e-9:
+            high[outside > 0] = -np.inf
+        elif plane[2] > 0:
+            high = np.minimum(high, -outside / plane[2])
+        else:
+            low = np.maximum(low, -outside / plane[2])
+    return (z >= low[..., None]) & (z <= high[..., None])
 
 
 class _Unseen(NamedTuple):
