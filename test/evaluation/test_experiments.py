@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros import cli
 from bayes3d_ros.bags import BagError, BagWriter
 from bayes3d_ros.evaluation import experiments
-from bayes3d_ros.evaluation.experiments import parsing
+from bayes3d_ros.evaluation.experiments import parsing, repeatability
 from bayes3d_ros.evaluation.ground_truth import GroundTruth, TrueObject
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library, save_model
@@ -253,6 +253,30 @@ def test_frames_of_every_recording_are_parsed(tmp_path, monkeypatch, depth_frame
     assert parsing.notes(False) == []
     monkeypatch.setenv("BAYES3D_DATA", str(tmp_path / "elsewhere"))
     assert str(tmp_path / "elsewhere") in parsing.notes(False)[0]
+
+
+def test_two_runs_are_compared_object_by_object(depth_frame, fake_posterior, library, tmp_path):
+    scene = replace(fake_posterior(depth_frame(), library.names), num_objects={1: 0.2, 2: 0.8}, ess=(0.5, 0.12))
+    here, there = estimate("block", pose((0, 0, 0.8))), estimate("slab", pose((0.2, 0, 0.8)))
+    moved = replace(there, position=there.position + [0, 0.0004, 0], type_probabilities={"slab": 0.87, "other": 0.13})
+    first, second = replace(scene, objects=(here, there)), replace(scene, objects=(moved, here), ess=(0.3,))
+    row = repeatability.frame_row("table", first, second)
+    assert row["means_apart"] == pytest.approx(0.4) and row["type_apart"] == pytest.approx(0.03)
+    assert row["count_apart"] == 0 and row["ess"] == [[0.5, 0.12], [0.3]]
+    good = repeatability.summary([row])
+    assert (good["stages"], good["smallest_ess"], good["not_met"]) == (3, 0.12, [])
+    far = replace(there, position=there.position + [0, 0.002, 0], type_probabilities={"slab": 0.8})
+    uneven = replace(scene, objects=(here, far), ess=(0.05,))
+    worse = repeatability.frame_row("table", first, uneven)
+    fewer = repeatability.frame_row("shelf", first, replace(second, objects=(here,), num_objects={1: 1.0}))
+    assert fewer["means_apart"] is None and fewer["count_apart"] == pytest.approx(0.8)
+    said = repeatability.summary([row, worse, fewer])
+    assert said["not_met"] == ["ess", "objects", "means", "types"] and said["stages_below"] == 1
+    assert all(repeatability.line(r) for r in (row, worse, fewer))
+    json.dumps([row, worse, fewer, said], allow_nan=False)
+    nothing = repeatability.frame_row("table", replace(scene, objects=()), replace(scene, objects=()))
+    assert nothing["means_apart"] == 0 and repeatability.summary([])["smallest_ess"] is None
+    assert repeatability.plot([row, worse, fewer], tmp_path)[0].stat().st_size > 1000
 
 
 def test_ground_truth_of_every_kind(tmp_path):

@@ -16,6 +16,7 @@ EXPERIMENTS: dict[str, str] = {
     "exactness": "bayes3d_ros.evaluation.experiments.exactness",
     "learning": "bayes3d_ros.evaluation.experiments.learning",
     "parsing": "bayes3d_ros.evaluation.experiments.parsing",
+    "repeatability": "bayes3d_ros.evaluation.experiments.repeatability",
 }
 
 
