@@ -20,12 +20,13 @@ from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Likelihood
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.scene_graph import Contact, Table
-from bayes3d_ros.model.scene_score import Image, draw_objects, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_scene, pad_scene
 
 CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 NEGLIGIBLE = 10.0  # nats: scenes of so much less weight are left as they are

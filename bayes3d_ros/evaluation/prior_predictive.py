@@ -10,10 +10,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.smc import OVERLAP_LIMIT
+from bayes3d_ros.model.image import FreePoints
 from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Pixels, inlier_density
 from bayes3d_ros.model.scene_graph import Contact, Table, overlap
-from bayes3d_ros.model.scene_score import FreePoints
 
 _BATCH, _TRIALS = 8, 200  # proposals of a scene drawn at a time; how many times
 _DEPTHS, _TAIL = 1024, 7.0  # depths of the sum, from and to so many sigma beyond what the window holds

@@ -12,13 +12,13 @@ from jaxtyping import Float
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid, for_returns, noise_grid
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.scene_score import Image
 
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 NEAR, FAR = 0.1, 2.0  # metres

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bayes3d_ros.inference.sketch_search import Evidence
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.scene_score import Image
 
 _ROUNDS = 10
 _WIDE, _TIGHT = 0.02, 0.006  # metres, how far off a point may be, first and last

@@ -34,10 +34,11 @@ from bayes3d_ros.inference.sketch_search import (
     score_cells,
     sketch_score,
 )
+from bayes3d_ros.model.image import Image, halved
 from bayes3d_ros.model.library_arrays import NUM_FACES, SKETCH_POINTS, LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 from bayes3d_ros.model.scene_graph import Contact, Table, log_prior, overlap
-from bayes3d_ros.model.scene_score import Image, halved, log_likelihood_gain, pad_scene
+from bayes3d_ros.model.scene_score import log_likelihood_gain, pad_scene
 
 _GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
 _MODES = 8

@@ -19,6 +19,7 @@ from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_t
 from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.inference.table import find_plane, table_frame, workspace
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, Likelihood
 from bayes3d_ros.model.objects import Library
@@ -26,7 +27,6 @@ from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, Table
-from bayes3d_ros.model.scene_score import Image
 from bayes3d_ros.model.summaries import summarise
 
 _NEGLIGIBLE = np.log(0.15)  # a number of objects this much less likely than the best ends the search for more

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.scene_score import Image
 
 CELL = 0.02  # metres
 YAWS = 24

@@ -20,9 +20,10 @@ from bayes3d_ros.evaluation.prior_predictive import (
 from bayes3d_ros.evaluation.ranks import rank
 from bayes3d_ros.inference.noise import NoiseGrid, noise_grid, sample
 from bayes3d_ros.inference.smc import OVERLAP_LIMIT
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Likelihood, Pixels, inlier_density, outlier_density
 from bayes3d_ros.model.scene_graph import log_prior, overlap
-from bayes3d_ros.model.scene_score import Image, log_likelihood_scene, pad_scene
+from bayes3d_ros.model.scene_score import log_likelihood_scene, pad_scene
 
 LIMITS, WINDOW, FOCAL = DepthRange(0.2, 1.0), 3, 60.0
 HEIGHT, WIDTH = 4, 6

@@ -10,13 +10,13 @@ import trimesh
 from jaxtyping import Float
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.scene_score import Image
 
 CAMERA = Intrinsics(84.0, 84.0, 39.5, 29.5, 80, 60)
 NEAR, FAR, SIGMA_MAX = 0.1, 5.0, 0.006

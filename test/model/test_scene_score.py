@@ -5,18 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayes3d_ros.model.image import FreePoints, Image, halved
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.scene_score import (
-    FreePoints,
-    Image,
-    draw_objects,
-    halved,
-    log_likelihood_gain,
-    log_likelihood_scene,
-    pad_scene,
-)
+from bayes3d_ros.model.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
 
 WIDTH, HEIGHT, WINDOW = 42, 30, 3  # no multiples of the tiles' side
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.4]))

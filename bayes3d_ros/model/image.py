@@ -1,0 +1,84 @@
+"""The observed depth image at scoring resolution, and the parts of it that are scored together."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.model.likelihood import NO_RETURN, Likelihood, Pixels
+
+
+class FreePoints(NamedTuple):
+    """Free 3D points by the pixels that they fall into, in L layers of at most one a pixel."""
+
+    depth: Float[Array, "L H W"]  # their z
+    kind: Int[Array, "L H W"]
+    beside_x: Float[Array, "L H W"]  # x / z less that of the pixel's ray
+    beside_y: Float[Array, "L H W"]
+
+
+class Image(NamedTuple):
+    """The observed depth at scoring resolution."""
+
+    depth: Float[Array, "H W"]  # metres, 0 where there is no return
+    kind: Int[Array, "H W"]
+    ray_x: Float[Array, "W"]
+    ray_y: Float[Array, "H"]
+    focal: Float[Array, "2"]
+    centre: Float[Array, "2"]
+    table: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
+    outlier_scale: Float[Array, ""]
+    front_margin: Float[Array, ""]
+    likelihood: Likelihood = Likelihood()
+    points: FreePoints | None = None  # scored in place of the depth image, of which the search still makes use
+
+
+def halved(image: Image) -> Image:
+    """Every second pixel of every second row: the same camera at half the resolution, a quarter of the work."""
+    return image._replace(
+        depth=image.depth[::2, ::2],
+        kind=image.kind[::2, ::2],
+        ray_x=image.ray_x[::2],
+        ray_y=image.ray_y[::2],
+        focal=image.focal / 2,
+        centre=image.centre / 2,
+        table=image.table[::2, ::2],
+        points=None,  # good enough for a search
+    )
+
+
+def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
+    """The observed pixels of tiles of a shape; those that stick out of the image have no return."""
+    height, width = image.depth.shape
+    rows, columns = (v + jnp.arange(shape[0])[:, None])[:, None], u + jnp.arange(shape[1])[:, None]
+    inside = (rows < height) & (columns < width)
+    rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
+    pixels = Pixels(
+        depth=image.depth[rows, columns],
+        kind=jnp.where(inside, image.kind[rows, columns], NO_RETURN),
+        ray_x=jnp.broadcast_to(image.ray_x[columns], inside.shape),
+        ray_y=jnp.broadcast_to(image.ray_y[rows], inside.shape),
+        step_x=1 / image.focal[0],
+        step_y=1 / image.focal[1],
+        outlier_scale=image.outlier_scale,
+        front_margin=image.front_margin,
+        likelihood=image.likelihood,
+    )
+    return pixels if image.points is None else _observed_points(image.points, pixels, rows, columns, inside)
+
+
+def _observed_points(points: FreePoints, pixels: Pixels, rows, columns, inside) -> Pixels:
+    """Free points in place of the depth of these pixels, layer after layer."""
+    count = points.depth.shape[0]
+
+    def in_every_layer(a: Array) -> Array:
+        return jnp.concatenate([a] * count, -1)
+
+    depth, kind, x, y = (jnp.concatenate(list(a[:, rows, columns]), -1) for a in points)
+    return pixels._replace(
+        depth=depth,
+        kind=jnp.where(in_every_layer(inside), kind, NO_RETURN),
+        ray_x=in_every_layer(pixels.ray_x),
+        ray_y=in_every_layer(pixels.ray_y),
+        beside=(x, y),
+    )
