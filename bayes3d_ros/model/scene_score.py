@@ -9,8 +9,9 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
-from bayes3d_ros.model.scene_graph import Contact, Table
-from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles
+from bayes3d_ros.model.rendering import renderers
+from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
+from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles, tiles_of_objects
 
 
 def border(window: int) -> tuple[int, int]:
@@ -21,6 +22,17 @@ def border(window: int) -> tuple[int, int]:
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
     pad = [(0, 0)] * (depth.ndim - 2) + [border(window)] * 2
     return jnp.pad(depth, pad, constant_values=jnp.inf)
+
+
+def _over_objects(work, carry, contact, image, library, table, half):
+    """`over_tiles` of the objects, drawn one a hypothesis."""
+    T = T_camera_object(contact, library, table)
+    tiles = tiles_of_objects(T[:, None], contact.type[:, None], image, library, half)
+
+    def draw(n, rays):
+        return renderers["march"](library, contact.type[n], T[n], rays)
+
+    return over_tiles(work, carry, tiles, len(T), draw, image, half)
 
 
 def _crop(scenes, index, u, v, side):
@@ -68,7 +80,7 @@ def log_likelihood_gain(
         return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
 
     gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_tiles(add, gains, contact, image, library, table, half)
+    return _over_objects(add, gains, contact, image, library, table, half)
 
 
 @partial(jax.jit, static_argnames="window")
@@ -91,7 +103,7 @@ def draw_objects(
         depth = jnp.where(inside, depth[half : half + TILE, half : half + TILE], jnp.inf)
         return drawn.at[n, half + rows, half + columns].min(depth)
 
-    return over_tiles(draw, scenes, contact, image, library, table, half)
+    return _over_objects(draw, scenes, contact, image, library, table, half)
 
 
 def log_likelihood_scene(

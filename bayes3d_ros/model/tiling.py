@@ -4,23 +4,22 @@ Tiles of all hypotheses form one list, worked through in chunks of static shape,
 the pixels that hypotheses cover and no N x H x W image is made.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.rendering import renderers
-from bayes3d_ros.model.scene_graph import T_camera_object
 
 TILE = 8
 CHUNK = 128
 
 
-class _Tiles(NamedTuple):
+class Tiles(NamedTuple):
     """Tiles lie in rows, R of them for every hypothesis; some are empty."""
 
     first: Int[Array, "N*R+1"]  # number of tiles in the rows before
@@ -32,50 +31,64 @@ class _Tiles(NamedTuple):
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.float32)
 _EDGES = np.argwhere(np.triu(np.abs(_CORNERS[:, None] - _CORNERS).sum(-1) == 1)).T
 _ROUNDING = 0.01  # pixels that a projection may be off
+_BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
 
 
-def _tiles(T: Float[Array, "N 4 4"], type_index: Int[Array, "N"], image: Image, library: LibraryArrays, half: int):
-    """The tiles that cover the outline of each object's grid in the image, grown by the window. A box that stands askew
-    fills little more than half of its bounding rectangle: each row of tiles is as long as the outline is wide there."""
+def tiles_of_objects(
+    T_camera_object: Float[Array, "N K 4 4"],
+    type_index: Int[Array, "N K"],
+    image: Image,
+    library: LibraryArrays,
+    half: int,
+    everywhere: Bool[Array, ""] | bool = False,
+) -> Tiles:
+    """The tiles that cover the outlines of the grids of each hypothesis' K objects in the image, grown by half a
+    window; those of the whole image if `everywhere`. A box that stands askew fills little more than half of its
+    bounding rectangle: each row of tiles is as long as the outlines are wide there."""
     height, width = image.depth.shape
-    extent = library.dims[type_index] * library.voxel_size[type_index][:, None]
-    points = library.origin[type_index][:, None] + _CORNERS * extent[:, None]
-    points = (T[:, None, :3, :3] * points[:, :, None, :]).sum(-1) + T[:, None, :3, 3]
+    T = T_camera_object
+    extent = library.dims[type_index] * library.voxel_size[type_index][..., None]
+    points = library.origin[type_index][..., None, :] + _CORNERS * extent[..., None, :]
+    points = (T[..., None, :3, :3] * points[..., None, :]).sum(-1) + T[..., None, :3, 3]
     z = points[..., 2]
-    u, v = (points[..., a] / jnp.maximum(z, 0.02) * image.focal[a] + image.centre[a] for a in range(2))
-    unclear = (z < 0.02).any(1) & (z.max(1) >= 0.02)  # reaches behind the camera: anywhere in the image
+    u, v = (points[..., a] / jnp.maximum(z, _BEHIND) * image.focal[a] + image.centre[a] for a in range(2))
+    ahead = z.max(2) >= _BEHIND
+    whole = everywhere | ((z < _BEHIND).any(2) & ahead).any(1)  # reaches behind the camera: anywhere in the image
 
     def pixels(low, high, limit):
         """First and one past the last pixel whose window meets [low, high]."""
         first = jnp.clip(jnp.ceil(low - _ROUNDING) - half, 0, limit).astype(jnp.int32)
         past = jnp.clip(jnp.floor(high + _ROUNDING) + half + 1, 0, limit).astype(jnp.int32)
-        whole = unclear.reshape(-1, *[1] * (low.ndim - 1))
-        return jnp.where(whole, 0, first), jnp.where(whole, limit, past)
+        anywhere = whole.reshape(-1, *[1] * (low.ndim - 1))
+        return jnp.where(anywhere, 0, first), jnp.where(anywhere, limit, past)
 
-    top, bottom = pixels(v.min(1), v.max(1), height)
+    def around(low: Array, high: Array) -> tuple[Array, Array]:
+        """The least and the largest over the objects ahead."""
+        out = ~ahead.reshape(*ahead.shape, *[1] * (low.ndim - 2))
+        return jnp.where(out, jnp.inf, low).min(1), jnp.where(out, -jnp.inf, high).max(1)
+
+    top, bottom = pixels(*around(v.min(2), v.max(2)), height)
     row = top[:, None] + TILE * jnp.arange(-(-height // TILE))
     # The outline between the first and the last line of pixels that the row's windows see.
-    low, high = row - half - _ROUNDING, row + TILE - 1 + half + _ROUNDING
-    (u0, u1), (v0, v1) = ([a[:, None, e] for e in _EDGES] for a in (u, v))
+    low, high = (a[:, None, :, None] for a in (row - half - _ROUNDING, row + TILE - 1 + half + _ROUNDING))
+    (u0, u1), (v0, v1) = ([a[:, :, None, e] for e in _EDGES] for a in (u, v))
     slope = (u1 - u0) / jnp.where(jnp.abs(v1 - v0) < 1e-6, 1e-6, v1 - v0)
-    inside = (jnp.minimum(v0, v1) <= high[..., None]) & (jnp.maximum(v0, v1) >= low[..., None])
-    ends = [u0 + slope * (jnp.clip(v, low[..., None], high[..., None]) - v0) for v in (v0, v1)]
+    inside = (jnp.minimum(v0, v1) <= high) & (jnp.maximum(v0, v1) >= low)
+    ends = [u0 + slope * (jnp.clip(v, low, high) - v0) for v in (v0, v1)]
     left = jnp.where(inside, jnp.minimum(*ends), jnp.inf).min(-1)
     right = jnp.where(inside, jnp.maximum(*ends), -jnp.inf).max(-1)
-    left, right = pixels(left, right, width)
-    seen = (row < bottom[:, None]) & (z.max(1) >= 0.02)[:, None]
+    left, right = pixels(*around(left, right), width)
+    seen = (row < bottom[:, None]) & (whole | ahead.any(1))[:, None]
     count = jnp.where(seen, -(-jnp.maximum(right - left, 0) // TILE), 0).ravel()
-    return _Tiles(jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count)]), left.ravel(), row.ravel())
+    return Tiles(jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count)]), left.ravel(), row.ravel())
 
 
-def over_tiles(work, carry, contact, image, library, table, half):
-    """carry = work(carry, hypothesis, u, v, object depth with border, real) over every chunk of tiles."""
-    T = T_camera_object(contact, library, table)
-    tiles = _tiles(T, contact.type, image, library, half)
-    total, rows = tiles.first[-1], tiles.u.shape[0] // contact.type.shape[0]
+def over_tiles(work: Callable, carry, tiles: Tiles, count: int, draw: Callable, image: Image, half: int):
+    """carry = work(carry, hypothesis, u, v, depth with border, real) over every chunk of tiles of `count` hypotheses;
+    draw(hypothesis, rays) gives depth along rays (x, y, 1) of shape [h, w, CHUNK]."""
+    total, rows = tiles.first[-1], tiles.u.shape[0] // count
     height, width = image.depth.shape
     offset = jnp.arange(-half, TILE + half)
-    render = renderers["march"]
 
     def chunk(state):
         start, carry = state
@@ -89,7 +102,7 @@ def over_tiles(work, carry, contact, image, library, table, half):
         shape = (side, side, CHUNK)
         x = jnp.broadcast_to((u + offset[:, None] - image.centre[0]) / image.focal[0], shape)
         y = jnp.broadcast_to(((v + offset[:, None] - image.centre[1]) / image.focal[1])[:, None], shape)
-        depth = render(library, contact.type[n], T[n], (x, y))
+        depth = draw(n, (x, y))
         # The scene's image ends at its rim: what is rendered beyond it belongs to no window.
         column, row = u + offset[:, None], (v + offset[:, None])[:, None]
         depth = jnp.where((column >= 0) & (column < width) & (row >= 0) & (row < height), depth, jnp.inf)
