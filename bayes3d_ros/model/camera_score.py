@@ -1,0 +1,86 @@
+"""Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from bayes3d_ros.model.image import Image, observed
+from bayes3d_ros.model.library_arrays import LibraryArrays
+from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
+from bayes3d_ros.model.rendering import renderers
+from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles, tiles_of_objects
+
+
+class World(NamedTuple):
+    """What the camera moves through."""
+
+    type: Int[Array, "K"]
+    T_world_object: Float[Array, "K 4 4"]
+    table: Bool[Array, ""]  # whether the plane z = 0 is a surface
+
+
+def product(A: Float[Array, "*batch 4 4"], B: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
+    """Of matrices, written out: a multiplication may run at reduced precision on some backends."""
+    return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
+
+
+def table_depth(
+    T_camera_world: Float[Array, "*n 4 4"], x: Float[Array, "*shape"], y: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Depth of the plane z = 0 of the world along rays (x, y, 1), inf where they do not meet its upper side."""
+    normal, origin = T_camera_world[..., :3, 2], T_camera_world[..., :3, 3]
+    facing = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]
+    depth = (normal * origin).sum(-1) / jnp.where(facing < -1e-3, facing, -1.0)
+    return jnp.where((facing < -1e-3) & (depth > 0), depth, jnp.inf)
+
+
+@partial(jax.jit, static_argnames="window")
+def log_likelihood_of_cameras(
+    T_camera_world: Float[Array, "N 4 4"],
+    world: World,
+    image: Image,
+    library: LibraryArrays,
+    noise: Noise,
+    window: int,
+) -> Float[Array, "N S P"]:
+    """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
+    rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
+    `image.table` is not used."""
+    half = window // 2
+    count, objects = len(T_camera_world), len(world.type)
+    T = product(T_camera_world[:, None], world.T_world_object)
+    kinds = jnp.broadcast_to(world.type, (count, objects))
+    tiles = tiles_of_objects(T, kinds, image, library, half, everywhere=world.table)
+
+    def draw(n, rays):
+        depth = jnp.where(world.table, table_depth(T_camera_world[n], *rays), jnp.inf)
+        for k in range(objects):
+            depth = jnp.minimum(depth, renderers["march"](library, kinds[n, k], T[n, k], rays))
+        return depth
+
+    def score(total, n, u, v, depth, real):
+        pixels = observed(image, u, v, (TILE, TILE))
+        value = log_likelihood(depth, pixels, noise, window)
+        alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
+        return total.at[n].add(jnp.where(real, value - alone, 0.0).transpose(2, 0, 1))
+
+    start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    assert CHUNK % 4 == 0
+    return over_tiles(score, start, tiles, count, draw, image, half)
+
+
+def render_camera(
+    T_camera_world: Float[Array, "4 4"],
+    world: World,
+    library: LibraryArrays,
+    rays: tuple[Float[Array, "H W"], Float[Array, "H W"]],
+) -> Float[Array, "H W"]:
+    """Depth along rays (x, y, 1) of what a camera there sees, inf where nothing is."""
+    depth = jnp.where(world.table, table_depth(T_camera_world, *rays), jnp.inf)
+    for k in range(len(world.type)):
+        T = product(T_camera_world, world.T_world_object[k])
+        depth = jnp.minimum(depth, renderers["march"](library, world.type[k], T, rays))
+    return depth
