@@ -99,7 +99,7 @@ def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
-    grid = noise_model.for_returns(noise_model.noise_grid(settings.sigma_max), blank.kind)
+    grid = noise_model.noise_grid(settings.sigma_max)
     return Problem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
 
 
@@ -142,7 +142,9 @@ def observe(
 
 def log_likelihood(surface: Float[np.ndarray, "H W"], image: Image, problem: Problem) -> float:
     """log p(image | rendered depth), noise integrated out, with the constant of `Samples`."""
-    return float(_log_likelihood(jnp.asarray(surface), image, problem.grid, problem.settings.window))
+    window = problem.settings.window
+    grid = noise_model.for_image(problem.grid, image, window)
+    return float(_log_likelihood(jnp.asarray(surface), image, grid, window))
 
 
 @partial(jax.jit, static_argnames="window")
@@ -158,9 +160,8 @@ _sample_noise = jax.jit(noise_model.sample)
 def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
     """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
     settings, context = problem.settings, Context(image, problem.library, problem.table)
-    state = smc.init(
-        context, problem.grid, settings.particles, settings.max_objects, _table_size(settings), settings.window
-    )
+    grid = noise_model.for_image(problem.grid, image, settings.window)
+    state = smc.init(context, grid, settings.particles, settings.max_objects, _table_size(settings), settings.window)
     stages, ess, log_mass = [], [], []
     for number in range(settings.max_objects + 1):
         if number:
@@ -169,7 +170,7 @@ def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
                 state,
                 jnp.int32(number - 1),
                 context,
-                problem.grid,
+                grid,
                 _table_size(settings),
                 settings.window,
                 settings.ess_threshold,
@@ -183,12 +184,12 @@ def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
                 state,
                 jnp.int32(number),
                 context,
-                problem.grid,
+                grid,
                 settings.window,
                 settings.ess_threshold,
                 Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating)),
             )
-        noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, problem.grid)
+        noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, grid)
         log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
         stages.append(
             Samples(

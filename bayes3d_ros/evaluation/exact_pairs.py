@@ -26,7 +26,7 @@ from bayes3d_ros.evaluation.exact_reference import (
     with_object,
 )
 from bayes3d_ros.evaluation.small_problems import Problem
-from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.noise import NoiseGrid, log_weight
 from bayes3d_ros.inference.smc import OVERLAP_LIMIT
 from bayes3d_ros.model.scene_graph import Contact, log_prior, overlap
 
@@ -56,7 +56,8 @@ def enumerate_apart(problem: Problem, levels: Levels = LEVELS) -> TwoObjects:
     parts = [enumerate_object(problem, scene, levels, close_to(*place)) for place in true_places(problem)]
     cells = [heaviest(part.cells) for part in parts]
     to_fine = _to_fine(problem.grid)
-    base = to_fine @ np.asarray(scene.table, np.float64).ravel() + np.asarray(problem.grid.log_mass, np.float64).ravel()
+    weight = np.asarray(log_weight(problem.grid), np.float64).ravel()
+    base = to_fine @ np.asarray(scene.table, np.float64).ravel() + weight
     best = [take(c.contact, [int(np.argmax(c.log_value))]) for c in cells]
     peak = base + to_fine @ sum(all_gains(problem, scene, contact).ravel() for contact in best)
     noise = np.flatnonzero(peak > peak.max() - _NOISE_WITHIN)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.inference.coarse_to_fine import Context
-from bayes3d_ros.inference.noise import NoiseGrid, for_returns, noise_grid
+from bayes3d_ros.inference.noise import NoiseGrid, for_image, noise_grid
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE
@@ -115,7 +115,7 @@ def make(
         front_margin=jnp.float32(3 * SIGMA_MAX),
     )
     context = Context(image, arrays, table)
-    return Problem(name, library, context, for_returns(noise_grid(SIGMA_MAX), context.image.kind), truth)
+    return Problem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, WINDOW), truth)
 
 
 def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Contact:

@@ -5,6 +5,7 @@ to interpolate, and far too coarse to sum.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.scene_score import log_likelihood_scene, pad_scene
 
 # Coarse grid: sigma_max 2^(-k/3), logit p. Each sigma costs a pass over the window, a p next to nothing.
 _SIGMA_STEPS, _P_STEPS = 11, 17
@@ -21,16 +24,26 @@ _SIGMA_FINE, _P_FINE = 24, 12  # fine points between coarse ones: 1 % of sigma, 
 _NEAR = 5  # coarse sigmas that a search looks at
 _P_LOW, _P_HIGH = 2e-4, 0.9
 _PARTS = 5  # of a fine step, in which noise is drawn
+_DENSE = 4  # sigmas of a reference scene in a coarse step
 
 
-def _to_parts(coarse: int, fine: int) -> Float[np.ndarray, "K C"]:
-    """Carries values on a coarse axis to the middles of parts of its fine steps. Both axes are evenly spaced."""
-    parts = (coarse - 1) * fine * _PARTS
-    places = (np.arange(parts) + 0.5) * (coarse - 1) / parts
-    return CubicSpline(np.arange(coarse), np.eye(coarse))(places).astype(np.float32)
+def _spline(points: int, places: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K N"]:
+    """Carries values on an axis 0, 1, .. to places on it."""
+    return CubicSpline(np.arange(points), np.eye(points))(places).astype(np.float32)
 
 
-_TO_SIGMA_PARTS, _TO_P_PARTS = _to_parts(_SIGMA_STEPS, _SIGMA_FINE), _to_parts(_P_STEPS, _P_FINE)
+def _parts(coarse: int, fine: int) -> Float[np.ndarray, "K"]:
+    """The middles of parts of the fine steps, on an axis whose coarse points are 0, 1, .."""
+    count = (coarse - 1) * fine * _PARTS
+    return (np.arange(count) + 0.5) * (coarse - 1) / count
+
+
+_TO_SIGMA_PARTS = _spline(_SIGMA_STEPS, _parts(_SIGMA_STEPS, _SIGMA_FINE))
+_TO_P_PARTS = _spline(_P_STEPS, _parts(_P_STEPS, _P_FINE))
+_DENSE_STEPS = (_SIGMA_STEPS - 1) * _DENSE + 1
+_TO_DENSE = _spline(_SIGMA_STEPS, np.arange(_DENSE_STEPS) / _DENSE)
+_DENSE_TO_FINE = _spline(_DENSE_STEPS, np.arange((_SIGMA_STEPS - 1) * _SIGMA_FINE + 1) * _DENSE / _SIGMA_FINE)
+_DENSE_TO_PARTS = _spline(_DENSE_STEPS, _parts(_SIGMA_STEPS, _SIGMA_FINE) * _DENSE)
 
 
 class NoiseGrid(NamedTuple):
@@ -43,6 +56,8 @@ class NoiseGrid(NamedTuple):
     log_mass: Float[Array, "Sf Pf"]  # prior mass of the fine points
     p_error: Float[Array, "Pf"]  # by which splines miss log(1 - p_outlier)
     returns: Float[Array, ""]  # how many returns a table sums over
+    sigma_error: Float[Array, "Sf P"]  # by which splines in sigma fall short of the log likelihood of a reference scene
+    sigma_error_parts: Float[Array, "K P"]  # the same at the parts of the fine steps
 
 
 def noise_grid(sigma_max: float) -> NoiseGrid:
@@ -67,12 +82,35 @@ def noise_grid(sigma_max: float) -> NoiseGrid:
         log_mass=jnp.float32(np.log(mass_sigma)[:, None] + np.log(mass_p)[None]),
         p_error=jnp.float32(CubicSpline(v, -np.logaddexp(0, v))(v_fine) + np.logaddexp(0, v_fine)),
         returns=jnp.float32(0),
+        sigma_error=jnp.zeros((len(u_fine), len(v)), jnp.float32),
+        sigma_error_parts=jnp.zeros((len(_DENSE_TO_PARTS), len(v)), jnp.float32),
     )
 
 
 def for_returns(grid: NoiseGrid, kind: Int[Array, "*shape"]) -> NoiseGrid:
     """The grid for tables of an image with these kinds of pixels. Those beyond the workspace hardly depend on p."""
     return grid._replace(returns=(jnp.asarray(kind) == IN_WORKSPACE).sum().astype(jnp.float32))
+
+
+@partial(jax.jit, static_argnames="window")
+def for_image(grid: NoiseGrid, image: Image, window: int) -> NoiseGrid:
+    """The grid for tables of this image: `for_returns`, and what splines in sigma miss.
+
+    Every return that goes from inlier to outlier as sigma falls bends the log likelihood within a tenth of log sigma,
+    less than half a coarse step. Errors are a nat or two, and move sigma by a third of its posterior's width. Most
+    returns do so alike in every scene, so the empty table is a reference: its log likelihood at four times as many
+    sigmas tells what splines make of every scene's.
+    """
+    ends = jnp.log(grid.coarse.sigma[0]), jnp.log(grid.coarse.sigma[-1])
+    dense = Noise(jnp.exp(jnp.linspace(*ends, _DENSE_STEPS)), grid.coarse.p_outlier)
+    table = log_likelihood_scene(pad_scene(image.table, window)[None], image, dense, window)[0]
+    table = table - table.max()
+    exact = jax.lax.Precision.HIGHEST
+    error = table - jnp.einsum("rs,sp->rp", jnp.asarray(_TO_DENSE), table[::_DENSE], precision=exact)
+    return for_returns(grid, image.kind)._replace(
+        sigma_error=jnp.einsum("fr,rp->fp", jnp.asarray(_DENSE_TO_FINE), error, precision=exact),
+        sigma_error_parts=jnp.einsum("kr,rp->kp", jnp.asarray(_DENSE_TO_PARTS), error, precision=exact),
+    )
 
 
 def _logit(p: float) -> float:
@@ -98,6 +136,8 @@ def near_peak(table: Float[Array, "S P"], grid: NoiseGrid) -> NoiseGrid:
         log_mass=part(grid.log_mass, first * _SIGMA_FINE, rows),
         p_error=grid.p_error,
         returns=grid.returns,
+        sigma_error=jnp.zeros((rows, grid.sigma_error.shape[1])),  # the spline of a part is another
+        sigma_error_parts=grid.sigma_error_parts,
     )
 
 
@@ -107,7 +147,14 @@ def _fine(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N Sf P
     exact = jax.lax.Precision.HIGHEST
     rows = jnp.einsum("fs,nsp->nfp", grid.to_fine_sigma, table - peak, precision=exact)
     fine = jnp.einsum("gp,nfp->nfg", grid.to_fine_p, rows, precision=exact)
-    return fine - grid.returns * grid.p_error + grid.log_mass
+    return fine + log_weight(grid)
+
+
+def log_weight(grid: NoiseGrid) -> Float[Array, "Sf Pf"]:
+    """What is added to splines of a table on the fine grid: the prior mass, and what splines are known to miss."""
+    exact = jax.lax.Precision.HIGHEST
+    missed = jnp.einsum("gp,fp->fg", grid.to_fine_p, grid.sigma_error, precision=exact)
+    return grid.log_mass + missed - grid.returns * grid.p_error
 
 
 def log_marginal(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N"]:
@@ -124,7 +171,7 @@ def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> 
     s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(table, grid), -1))
     exact = jax.lax.Precision.HIGHEST
     relative = table - table.max((-2, -1), keepdims=True)
-    given_sigma = jnp.einsum("ns,nsp->np", grid.to_fine_sigma[s], relative, precision=exact)
+    given_sigma = jnp.einsum("ns,nsp->np", grid.to_fine_sigma[s], relative, precision=exact) + grid.sigma_error[s]
     ends_u, ends_v = jnp.log(grid.coarse.sigma), jnp.log(_odds(grid.coarse.p_outlier))
     # log(1 - p) of every return without the spline's error: its own spline taken out, itself put in.
     part, v = _draw_along(
@@ -134,8 +181,10 @@ def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> 
         _TO_P_PARTS,
         lambda v: -(1 + grid.returns) * jax.nn.softplus(v) - jax.nn.softplus(-v),
     )
-    given_p = jnp.einsum("np,nsp->ns", jnp.asarray(_TO_P_PARTS)[part], relative, precision=exact)
-    _, u = _draw_along(sigma_key, given_p, ends_u, _TO_SIGMA_PARTS, lambda u: u)
+    to_p = jnp.asarray(_TO_P_PARTS)[part]
+    given_p = jnp.einsum("np,nsp->ns", to_p, relative, precision=exact)
+    missed = jnp.einsum("np,kp->nk", to_p, grid.sigma_error_parts, precision=exact)
+    _, u = _draw_along(sigma_key, given_p, ends_u, _TO_SIGMA_PARTS, lambda u: u + missed)
     return Noise(jnp.exp(u), jax.nn.sigmoid(v))
 
 

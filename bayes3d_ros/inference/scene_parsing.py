@@ -74,7 +74,7 @@ class SceneParser:
         with contextlib.suppress(ParseError):  # unusual settings may leave nothing of the frame
             self.parse(frame)
             image, table, *_ = self._observe(frame)
-            context, grid = Context(image, self._arrays, table), noise_model.for_returns(self._grid, image.kind)
+            context, grid = self._context(image, table)
             self._refreshed(_frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
         rays = jnp.zeros((height, width))
         self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
@@ -84,7 +84,7 @@ class SceneParser:
         start = time.perf_counter()
         settings = self.settings
         image, table, T_camera_table, notes = self._observe(frame)
-        context, grid = Context(image, self._arrays, table), noise_model.for_returns(self._grid, image.kind)
+        context, grid = self._context(image, table)
         stages, ess = self._sample(_frame_key(settings.seed, frame.stamp_ns), context, grid)
         samples, log_evidence = self._mix(stages, table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
@@ -146,6 +146,9 @@ class SceneParser:
         )
         table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
         return image, table, T_camera_table, notes
+
+    def _context(self, image: Image, table: Table) -> tuple[Context, NoiseGrid]:
+        return Context(image, self._arrays, table), noise_model.for_image(self._grid, image, self.settings.window)
 
     def _find_table(
         self, frame: DepthFrame, points: Float[np.ndarray, "N 3"]
