@@ -72,15 +72,28 @@ def log_likelihood_of_cameras(
     return over_tiles(score, start, tiles, count, draw, image, half)
 
 
+def render_cameras(
+    T_camera_world: Float[Array, "N 4 4"],
+    world: World,
+    library: LibraryArrays,
+    rays: tuple[Float[Array, "N H W"], Float[Array, "N H W"]],
+) -> Float[Array, "N H W"]:
+    """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is."""
+    T = T_camera_world[:, None, None]
+    depth = jnp.where(world.table, table_depth(T, *rays), jnp.inf)
+    for k in range(len(world.type)):
+        depth = jnp.minimum(
+            depth, renderers["march"](library, world.type[k], product(T, world.T_world_object[k]), rays)
+        )
+    return depth
+
+
 def render_camera(
     T_camera_world: Float[Array, "4 4"],
     world: World,
     library: LibraryArrays,
     rays: tuple[Float[Array, "H W"], Float[Array, "H W"]],
 ) -> Float[Array, "H W"]:
-    """Depth along rays (x, y, 1) of what a camera there sees, inf where nothing is."""
-    depth = jnp.where(world.table, table_depth(T_camera_world, *rays), jnp.inf)
-    for k in range(len(world.type)):
-        T = product(T_camera_world, world.T_world_object[k])
-        depth = jnp.minimum(depth, renderers["march"](library, world.type[k], T, rays))
-    return depth
+    """What one camera sees."""
+    x, y = rays
+    return render_cameras(T_camera_world[None], world, library, (x[None], y[None]))[0]

@@ -1,0 +1,358 @@
+"""Where a moving camera is in a known world, frame by frame: a particle filter over its pose, six degrees of freedom.
+
+State: weighted pairs of a pose and the motion that led to it. Motion keeps its velocity, T_t = Exp(e) D T_(t-1) with D
+the last motion and e Student t; depth is scored by the likelihood of `model/likelihood.py`, noise integrated out. Each
+frame the likelihood is searched coarse to fine for a mixture q; draws from it have the weight
+
+    p(image | T) sum_j w_j p(T | particle j) / q(T),
+
+the predictive of the whole population, not of one ancestor (the marginal particle filter, Klaas et al. 2005), so that
+the search may go where the image says and the weights stay proper. Densities are over SE(3)'s invariant measure.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from math import ceil
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.inference import noise as noise_model
+from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.resampling import effective_fraction, normalised
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_cameras
+from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.library_arrays import LibraryArrays
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+
+_FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
+_BLURS = (0.012, 0.003, 0.0)  # metres of sigma at least, round by round: before alignment, and after
+_ROUND_SHARE = 0.12  # of the hypotheses, each round
+_STARTS = 4  # of alignment
+_LEAST_OUTLIERS = 0.02  # p_outlier while searching: with less, one bad pixel decides
+_REACH = (0.03, 0.02, 0.01, 0.005, 0.003, 0.003)  # metres: residuals beyond count little, step by step
+_DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
+_RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
+_KEEP = 0.25  # share of a round's draws that stay effective when they are weighed
+_WIDEN = 1.5  # of the scale learned from a round, for the next
+_FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
+_SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
+
+
+class Motion(NamedTuple):
+    """How a camera may move between two frames beyond keeping its velocity: scales of a t distribution."""
+
+    shift: Float[Array, ""]  # metres
+    turn: Float[Array, ""]  # radians
+
+
+class Scene(NamedTuple):
+    """What is fixed while a camera is tracked."""
+
+    world: World
+    library: LibraryArrays
+    pivot: Float[Array, "3"]  # of the world: motions are described about it, where shift and turn do not mix
+
+
+class State(NamedTuple):
+    """N weighted particles."""
+
+    T_camera_world: Float[Array, "N 4 4"]
+    motion: Float[Array, "N 4 4"]  # T_camera_world = motion @ that of the frame before
+    log_weight: Float[Array, "N"]  # normalised
+    sigma: Float[Array, ""]  # of the last frame's noise, the likeliest on the grid: where the search begins
+    p_outlier: Float[Array, ""]
+
+
+class Info(NamedTuple):
+    """What a frame said."""
+
+    T_camera_world: Float[Array, "4 4"]  # the mean
+    covariance: Float[Array, "6 6"]  # of (shift, turn) about the pivot, on the camera's axes
+    log_evidence: Float[Array, ""]  # log p(image | images before) - log p(image | nothing in sight)
+    ess: Float[Array, ""]  # fraction
+    sigma: Float[Array, ""]
+    p_outlier: Float[Array, ""]
+
+
+def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_outlier: float = 0.05) -> State:
+    """A camera whose pose is given, at rest."""
+    every = jnp.broadcast_to(jnp.asarray(T_camera_world, jnp.float32), (particles, 4, 4))
+    return State(
+        every,
+        jnp.broadcast_to(jnp.eye(4), (particles, 4, 4)),
+        jnp.full(particles, -jnp.log(particles), jnp.float32),
+        jnp.float32(sigma),
+        jnp.float32(p_outlier),
+    )
+
+
+def exp_about(tangent: Float[Array, "*n 6"], centre: Float[Array, "3"]) -> Float[Array, "*n 4 4"]:
+    """The motion (shift, turn) about a centre."""
+    T = jaxlie.SE3.exp(tangent).as_matrix()
+    moved = T[..., :3, 3] + centre - (T[..., :3, :3] * centre).sum(-1)
+    return T.at[..., :3, 3].set(moved)
+
+
+def log_about(T: Float[Array, "*n 4 4"], centre: Float[Array, "3"]) -> Float[Array, "*n 6"]:
+    """The inverse of `exp_about`."""
+    moved = T[..., :3, 3] - centre + (T[..., :3, :3] * centre).sum(-1)
+    return jaxlie.SE3.from_matrix(T.at[..., :3, 3].set(moved)).log()
+
+
+def inverse(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
+    R = jnp.swapaxes(T[..., :3, :3], -1, -2)
+    back = -(R * T[..., None, :3, 3]).sum(-1)
+    return T.at[..., :3, :3].set(R).at[..., :3, 3].set(back)
+
+
+def rigid(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
+    """With a rotation that is one: rounding errors of products double from frame to frame."""
+    return jaxlie.SE3.from_matrix(T).normalize().as_matrix()
+
+
+def log_volume(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n"]:
+    """log of the invariant measure per Lebesgue measure of the tangent: 2 log(2 (1 - cos a) / a^2), a the angle."""
+    square = (tangent[..., 3:] ** 2).sum(-1)
+    safe = jnp.where(square < 1e-4, 1.0, square)
+    exact = jnp.log(2 * (1 - jnp.cos(jnp.sqrt(safe))) / safe)
+    return 2 * jnp.where(square < 1e-4, -square / 12, exact)
+
+
+def _log_t(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """log density of a standard t in six dimensions, given the squared distance from its centre."""
+    nu = _FREEDOM
+    log_norm = jax.scipy.special.gammaln((nu + 6) / 2) - jax.scipy.special.gammaln(nu / 2) - 3 * jnp.log(nu * jnp.pi)
+    return log_norm - (nu + 6) / 2 * jnp.log1p(square / nu)
+
+
+def _draw_t(key: PRNGKeyArray, count: int) -> Float[Array, "N 6"]:
+    gauss_key, chi_key = jax.random.split(key)
+    stretch = jnp.sqrt(_FREEDOM / jax.random.chisquare(chi_key, _FREEDOM, shape=(count, 1)))
+    return jax.random.normal(gauss_key, (count, 6)) * stretch
+
+
+def _scales(motion: Motion) -> Float[Array, "6"]:
+    return jnp.concatenate([jnp.full(3, motion.shift), jnp.full(3, motion.turn)])
+
+
+def log_predictive(
+    T: Float[Array, "D 4 4"], expected: Float[Array, "N 4 4"], log_weight: Float[Array, "N"], motion: Motion
+) -> Float[Array, "D N"]:
+    """log of w_j p(T | particle j), where each particle's velocity leads to `expected`."""
+    change = log_about(product(T[:, None], inverse(expected)), jnp.zeros(3))
+    scale = _scales(motion)
+    log_p = _log_t(((change / scale) ** 2).sum(-1)) - jnp.log(scale).sum() - log_volume(change)
+    return log_p + log_weight
+
+
+class _Chart(NamedTuple):
+    """Poses as tangents about a reference, and a t distribution over them."""
+
+    reference: Float[Array, "4 4"]
+    centre: Float[Array, "3"]  # the pivot in the reference camera
+    mean: Float[Array, "6"]
+    scale: Float[Array, "6 6"]  # lower Cholesky factor
+
+    def pose(self, tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
+        return product(exp_about(tangent, self.centre), self.reference)
+
+    def tangent(self, T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6"]:
+        return log_about(product(T, inverse(self.reference)), self.centre)
+
+    def log_density(self, T: Float[Array, "D 4 4"]) -> Float[Array, "D"]:
+        tangent = self.tangent(T)
+        z = jax.scipy.linalg.solve_triangular(self.scale, (tangent - self.mean).T, lower=True).T
+        return _log_t((z**2).sum(-1)) - jnp.log(jnp.diag(self.scale)).sum() - log_volume(tangent)
+
+
+def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D"]) -> _Chart:
+    """The t distribution moved to where draws [D] have high log likelihoods, tempered so that enough of them count."""
+    value = jnp.maximum(value - value.max(), -1e6)
+
+    def weights(beta: Array) -> Array:
+        return jax.nn.softmax(beta * value)
+
+    def halve(bounds, _):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        enough = 1 / (weights(jnp.exp(middle)) ** 2).sum() >= _KEEP * len(value)
+        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
+
+    (low, _), _ = jax.lax.scan(halve, (jnp.float32(-16.0), jnp.float32(0.0)), None, length=14)
+    weight = weights(jnp.exp(low))
+    mean = weight @ tangent
+    unit = jnp.array(_SMALLEST)
+    centred = (tangent - mean) / unit
+    square = jnp.einsum("d,da,db->ab", weight, centred, centred, precision=jax.lax.Precision.HIGHEST) + jnp.eye(6)
+    old = chart.scale / unit[:, None]
+    square = 0.5 * square + 0.5 * jnp.einsum("ab,cb->ac", old, old, precision=jax.lax.Precision.HIGHEST)
+    return chart._replace(mean=mean, scale=unit[:, None] * jnp.linalg.cholesky(square))
+
+
+@partial(jax.jit, static_argnames=("hypotheses", "window"))
+def step(
+    key: PRNGKeyArray,
+    state: State,
+    image: Image,
+    scene: Scene,
+    grid: NoiseGrid,
+    motion: Motion,
+    hypotheses: int,
+    window: int,
+) -> tuple[State, Info]:
+    """The posterior one frame later, with `hypotheses` images scored or rendered in all; of the state's particles there
+    have to be as many as `shares` says."""
+    _, own = shares(hypotheses)
+    if len(state.log_weight) != own:
+        raise ValueError(f"expected {own} particles of {hypotheses} hypotheses, got {len(state.log_weight)}")
+    expected = product(state.motion, state.T_camera_world)
+    search_key, draw_key, ancestor_key = jax.random.split(key, 3)
+
+    def score(T: Float[Array, "D 4 4"], noise: Noise) -> Float[Array, "D S P"]:
+        return log_likelihood_of_cameras(T, scene.world, image, scene.library, noise, window)
+
+    chart = _search(search_key, state, expected, image, scene, motion, hypotheses, score)
+    T = _propose(draw_key, chart, expected, state.log_weight, motion, own)
+    by_ancestor = log_predictive(T, expected, state.log_weight, motion)
+    log_prior = jax.nn.logsumexp(by_ancestor, 1)
+    log_q = jnp.logaddexp(
+        jnp.log1p(-_FROM_MOTION) + chart.log_density(T),
+        jnp.log(_FROM_MOTION) + log_prior,
+    )
+    table = score(T, grid.coarse)
+    log_likelihood = noise_model.log_marginal(table, grid)
+    log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
+    ancestor = jax.random.categorical(ancestor_key, by_ancestor)
+    T = rigid(T)
+    moved = rigid(product(T, inverse(state.T_camera_world[ancestor])))
+    noise = noise_model.peak(table[jnp.argmax(log_weight)], grid)
+    new = State(T, moved, log_weight, noise.sigma[0], noise.p_outlier[0])
+    mean, covariance = _moments(chart, T, log_weight)
+    return new, Info(
+        mean,
+        covariance,
+        log_evidence - jnp.log(own),
+        effective_fraction(log_weight),
+        noise.sigma[0],
+        noise.p_outlier[0],
+    )
+
+
+def shares(hypotheses: int) -> tuple[int, int]:
+    """Of the hypotheses of a frame: those of a round of the search, and the filter's own draws, its particles. The rest
+    serves alignment. Raises ValueError for too few."""
+    each, aligning = int(_ROUND_SHARE * hypotheses), _STARTS * (1 + _RENDERED * (1 + len(_REACH)))
+    own = hypotheses - len(_BLURS) * each - aligning
+    if own < each:
+        least = ceil(aligning / (1 - (1 + len(_BLURS)) * _ROUND_SHARE))
+        raise ValueError(f"expected at least {least} hypotheses, got {hypotheses}")
+    return each, own
+
+
+def _search(
+    key: PRNGKeyArray,
+    state: State,
+    expected: Float[Array, "N 4 4"],
+    image: Image,
+    scene: Scene,
+    motion: Motion,
+    hypotheses: int,
+    score: Callable[[Float[Array, "D 4 4"], Noise], Float[Array, "D S P"]],
+) -> _Chart:
+    """A distribution near the likelihood's: draws of the predictive at a blurred noise, the best of them aligned to the
+    image, the best of those narrowed round by round."""
+    each, _ = shares(hypotheses)
+    p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
+    blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]
+    best = expected[jnp.argmax(state.log_weight)]
+    centre = (best[:3, :3] * scene.pivot).sum(-1) + best[:3, 3]
+    scale = _scales(motion)
+    chart = _Chart(best, centre, jnp.zeros(6), jnp.diag(scale))
+    draw_key, pick_key = jax.random.split(jax.random.fold_in(key, 0))
+    index = jax.random.categorical(pick_key, state.log_weight, shape=(each,))
+    tried = product(exp_about(_draw_t(draw_key, each) * scale, jnp.zeros(3)), expected[index]).at[0].set(best)
+    _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
+    means, scales = jax.lax.map(
+        lambda start: _aligned(chart, start, image, scene, scale, state.sigma), chart.tangent(tried[starts])
+    )
+    pick = jnp.argmax(score(chart.pose(means), blurs[1])[:, 0, 0])
+    chart = chart._replace(mean=means[pick], scale=scales[pick])
+    for number, noise in enumerate(blurs[1:], 1):
+        step = _WIDEN * _draw_t(jax.random.fold_in(key, number), each) @ chart.scale.T
+        tangent = (chart.mean + step).at[0].set(chart.mean)
+        chart = _learned(chart, tangent, score(chart.pose(tangent), noise)[:, 0, 0])
+    return chart
+
+
+def _aligned(
+    chart: _Chart,
+    start: Float[Array, "6"],
+    image: Image,
+    scene: Scene,
+    scale: Float[Array, "6"],
+    sigma: Float[Array, ""],
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """Gauss-Newton on the differences between observed and rendered depth; where it ends, and the scale of the errors
+    left, if they are independent and as large as sigma."""
+    height, width = image.depth.shape
+    shape = (_RENDERED, height, width)
+    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
+    delta = jnp.array(_DELTA)
+    around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
+    valid = image.kind == IN_WORKSPACE
+
+    def linear(mean: Array) -> tuple[Array, Array, Array]:
+        """Residuals, slopes of the rendered depth, and where there are both."""
+        depth = render_cameras(chart.pose(mean + around), scene.world, scene.library, rays)
+        seen = valid & jnp.isfinite(depth).all(0)
+        depth = jnp.where(seen, depth, 0.0)
+        slope = (depth[1:7] - depth[7:]) / (2 * delta[:, None, None])
+        return jnp.where(seen, image.depth - depth[0], 0.0), slope, seen
+
+    def information(slope: Array, weight: Array) -> Array:
+        return jnp.einsum("ahw,hw,bhw->ab", slope, weight, slope, precision=jax.lax.Precision.HIGHEST)
+
+    def one(mean: Array, reach: Array) -> tuple[Array, None]:
+        residual, slope, seen = linear(mean)
+        weight = jnp.where(seen, 1 / (1 + (residual / reach) ** 2) ** 2, 0.0) / reach**2
+        pull = jnp.einsum("ahw,hw,hw->a", slope, weight, residual, precision=jax.lax.Precision.HIGHEST)
+        square = information(slope * scale[:, None, None], weight) + 0.01 * jnp.eye(6)
+        return mean + scale * jnp.linalg.solve(square, scale * pull), None
+
+    mean, _ = jax.lax.scan(one, start, jnp.array(_REACH))
+    _, slope, seen = linear(mean)
+    # With ones on the diagonal: metres and radians, and a prior a thousand times wider, are too much for float32.
+    precision = information(slope, jnp.where(seen, 1 / sigma**2, 0.0)) + jnp.diag(1 / scale**2)
+    unit = 1 / jnp.sqrt(jnp.diag(precision))
+    covariance = jnp.linalg.inv(precision * unit[:, None] * unit + 1e-4 * jnp.eye(6))
+    return mean, unit[:, None] * jnp.linalg.cholesky(covariance)
+
+
+def _propose(
+    key: PRNGKeyArray,
+    chart: _Chart,
+    expected: Float[Array, "N 4 4"],
+    log_weight: Float[Array, "N"],
+    motion: Motion,
+    count: int,
+) -> Float[Array, "D 4 4"]:
+    """Draws from the mixture of what the search learned and the predictive."""
+    keys = jax.random.split(key, 4)
+    searched = chart.pose(chart.mean + _draw_t(keys[0], count) @ chart.scale.T)
+    index: Int[Array, "D"] = jax.random.categorical(keys[1], log_weight, shape=(count,))
+    predicted = product(exp_about(_draw_t(keys[2], count) * _scales(motion), jnp.zeros(3)), expected[index])
+    from_motion = jax.random.uniform(keys[3], (count,)) < _FROM_MOTION
+    return jnp.where(from_motion[:, None, None], predicted, searched)
+
+
+def _moments(
+    chart: _Chart, T: Float[Array, "N 4 4"], log_weight: Float[Array, "N"]
+) -> tuple[Float[Array, "4 4"], Float[Array, "6 6"]]:
+    weight, tangent = jnp.exp(log_weight), chart.tangent(T)
+    mean = weight @ tangent
+    centred = tangent - mean
+    return chart.pose(mean), jnp.einsum("n,na,nb->ab", weight, centred, centred)
