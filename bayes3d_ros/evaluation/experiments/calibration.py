@@ -28,7 +28,7 @@ from bayes3d_ros.model.scene_graph import Contact
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-SCENES, QUICK_SCENES = 1000, 40
+SCENES, QUICK_SCENES = 1000, 32
 SEED = 11  # not one that the sampler was tuned on (4)
 LATENTS = ("n", "x", "y", "yaw", "sigma", "p_outlier", "log_likelihood")
 OBJECT = ("x", "y", "yaw")  # of the object with the smallest x, given that there is an object; yaw is cut at 0
