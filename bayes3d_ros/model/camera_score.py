@@ -11,7 +11,7 @@ from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.model.rendering import renderers
-from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles, tiles_of_objects
+from bayes3d_ros.model.tiling import TILE, over_tiles, tiles_of_objects
 
 
 class World(NamedTuple):
@@ -56,10 +56,7 @@ def log_likelihood_of_cameras(
     tiles = tiles_of_objects(T, kinds, image, library, half, everywhere=world.table)
 
     def draw(n, rays):
-        depth = jnp.where(world.table, table_depth(T_camera_world[n], *rays), jnp.inf)
-        for k in range(objects):
-            depth = jnp.minimum(depth, renderers["march"](library, kinds[n, k], T[n, k], rays))
-        return depth
+        return depth_along(T_camera_world[n], world, library, rays)
 
     def score(total, n, u, v, depth, real):
         pixels = observed(image, u, v, (TILE, TILE))
@@ -68,8 +65,22 @@ def log_likelihood_of_cameras(
         return total.at[n].add(jnp.where(real, value - alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    assert CHUNK % 4 == 0
     return over_tiles(score, start, tiles, count, draw, image, half)
+
+
+def depth_along(
+    T_camera_world: Float[Array, "*n 4 4"],
+    world: World,
+    library: LibraryArrays,
+    rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
+) -> Float[Array, "*shape"]:
+    """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is; `n` broadcasts against `shape` from
+    the right."""
+    depth = jnp.where(world.table, table_depth(T_camera_world, *rays), jnp.inf)
+    for k in range(len(world.type)):
+        T = product(T_camera_world, world.T_world_object[k])
+        depth = jnp.minimum(depth, renderers["march"](library, world.type[k], T, rays))
+    return depth
 
 
 def render_cameras(
@@ -78,14 +89,8 @@ def render_cameras(
     library: LibraryArrays,
     rays: tuple[Float[Array, "N H W"], Float[Array, "N H W"]],
 ) -> Float[Array, "N H W"]:
-    """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is."""
-    T = T_camera_world[:, None, None]
-    depth = jnp.where(world.table, table_depth(T, *rays), jnp.inf)
-    for k in range(len(world.type)):
-        depth = jnp.minimum(
-            depth, renderers["march"](library, world.type[k], product(T, world.T_world_object[k]), rays)
-        )
-    return depth
+    """What each camera sees along its rays."""
+    return depth_along(T_camera_world[:, None, None], world, library, rays)
 
 
 def render_camera(
@@ -95,5 +100,4 @@ def render_camera(
     rays: tuple[Float[Array, "H W"], Float[Array, "H W"]],
 ) -> Float[Array, "H W"]:
     """What one camera sees."""
-    x, y = rays
-    return render_cameras(T_camera_world[None], world, library, (x[None], y[None]))[0]
+    return depth_along(T_camera_world, world, library, rays)
