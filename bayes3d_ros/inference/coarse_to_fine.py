@@ -42,7 +42,7 @@ from bayes3d_ros.model.scene_score import log_likelihood_gain, pad_scene
 
 _GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
 _MODES = 8
-_FIT = (24, 3)  # draws a mode, rounds
+_FIT = (24, 5)  # draws a mode, rounds
 _LOOSE = (0.012, 0.012, 0.3)  # metres, metres, radians: how far off alignment may be where no surface holds it
 _ALIGNED = 0.015  # metres of residual that one sketch point is worth
 _BEHIND = 1e6  # nats

@@ -255,28 +255,56 @@ def test_frames_of_every_recording_are_parsed(tmp_path, monkeypatch, depth_frame
     assert str(tmp_path / "elsewhere") in parsing.notes(False)[0]
 
 
-def test_two_runs_are_compared_object_by_object(depth_frame, fake_posterior, library, tmp_path):
-    scene = replace(fake_posterior(depth_frame(), library.names), num_objects={1: 0.2, 2: 0.8}, ess=(0.5, 0.12))
+@pytest.fixture
+def run_with(depth_frame, fake_posterior):
+    """run(objects, **fields): a posterior of these estimates, two samples about each, one sigma to either side."""
+
+    def run(*objects, weight=(0.5, 0.5), away=(-0.001, 0.001), **fields):
+        base = fake_posterior(depth_frame(), ("block", "slab"), count=2)
+        kind = [("block", "slab").index(o.type) for o in objects]
+        place = np.stack([[o.position + step for o in objects] for step in away]).reshape(2, -1, 3)
+        index = np.tile(np.arange(len(objects)), (2, 1))
+        samples = base.samples._replace(log_weight=np.log(weight), type=np.tile(kind, (2, 1)), position=place)
+        return replace(base, objects=objects, samples=samples, object_index=index, **fields)
+
+    return run
+
+
+def test_two_runs_are_compared_object_by_object(run_with, tmp_path):
+    said = {"num_objects": {1: 0.2, 2: 0.8}}
     here, there = estimate("block", pose((0, 0, 0.8))), estimate("slab", pose((0.2, 0, 0.8)))
     moved = replace(there, position=there.position + [0, 0.0004, 0], type_probabilities={"slab": 0.87, "other": 0.13})
-    first, second = replace(scene, objects=(here, there)), replace(scene, objects=(moved, here), ess=(0.3,))
+    first, second = run_with(here, there, ess=(0.5, 0.12), **said), run_with(moved, here, ess=(0.3,), **said)
     row = repeatability.frame_row("table", first, second)
-    assert row["means_apart"] == pytest.approx(0.4) and row["type_apart"] == pytest.approx(0.03)
+    assert row["means_apart"] == pytest.approx(0.4, abs=1e-5) and row["type_apart"] == pytest.approx(0.03)
+    assert row["poses_apart"] == pytest.approx(0.4, abs=1e-5)
     assert row["count_apart"] == 0 and row["ess"] == [[0.5, 0.12], [0.3]]
     good = repeatability.summary([row])
     assert (good["stages"], good["smallest_ess"], good["not_met"]) == (3, 0.12, [])
     far = replace(there, position=there.position + [0, 0.002, 0], type_probabilities={"slab": 0.8})
-    uneven = replace(scene, objects=(here, far), ess=(0.05,))
+    uneven = run_with(here, far, ess=(0.05,), **said)
     worse = repeatability.frame_row("table", first, uneven)
-    fewer = repeatability.frame_row("shelf", first, replace(second, objects=(here,), num_objects={1: 1.0}))
+    fewer = repeatability.frame_row("shelf", first, run_with(here, num_objects={1: 1.0}))
     assert fewer["means_apart"] is None and fewer["count_apart"] == pytest.approx(0.8)
-    said = repeatability.summary([row, worse, fewer])
-    assert said["not_met"] == ["ess", "objects", "means", "types"] and said["stages_below"] == 1
+    told = repeatability.summary([row, worse, fewer])
+    assert told["not_met"] == ["ess", "objects", "means", "types"] and told["stages_below"] == 1
     assert all(repeatability.line(r) for r in (row, worse, fewer))
-    json.dumps([row, worse, fewer, said], allow_nan=False)
-    nothing = repeatability.frame_row("table", replace(scene, objects=()), replace(scene, objects=()))
+    json.dumps([row, worse, fewer, told], allow_nan=False)
+    nothing = repeatability.frame_row("table", run_with(), run_with())
     assert nothing["means_apart"] == 0 and repeatability.summary([])["smallest_ess"] is None
     assert repeatability.plot([row, worse, fewer], tmp_path)[0].stat().st_size > 1000
+
+
+def test_runs_that_call_either_of_two_modes_heaviest_have_means_close_by(run_with):
+    there = estimate("slab", pose((0.2, 0, 0.8)))
+    other = replace(there, position=there.position + [0.05, 0, 0])
+    row = repeatability.frame_row(
+        "table",
+        run_with(there, weight=(0.55, 0.45), away=(0.0, np.array([0.05, 0, 0]))),
+        run_with(other, weight=(0.55, 0.45), away=(0.0, np.array([-0.05, 0, 0]))),
+    )
+    assert row["means_apart"] == pytest.approx(0.1 / np.sqrt(0.55 * 0.45), abs=1e-5)  # in standard deviations
+    assert row["poses_apart"] == pytest.approx(50)
 
 
 def test_ground_truth_of_every_kind(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
@@ -26,7 +27,10 @@ __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 SEEDS = (0, 1)
 # What issue 4 asks for: effective share of the particles, standard deviations, probability.
 LEAST_ESS, APART, TYPE_APART = 0.1, 1.0, 0.05
-HEADER = f"{'recording':<18} {'frame':>20}  {'means apart':>11} {'p(type)':>8} {'p(n)':>6}  ESS of every stage"
+HEADER = (
+    f"{'recording':<18} {'frame':>20}  {'means apart':>11} {'poses apart':>11} {'p(type)':>8} {'p(n)':>6}"
+    "  ESS of every stage"
+)
 
 
 def count(quick: bool) -> int:
@@ -47,35 +51,55 @@ def steps(quick: bool) -> Iterator[list[Row]]:
 
 
 def frame_row(bag: str, first: ScenePosterior, second: ScenePosterior) -> Row:
-    """What two runs on one frame say; `means_apart` and `type_apart` are None where they list other numbers of
-    objects."""
-    pairs = matched(first.objects, second.objects)
+    """What two runs on one frame say. `means_apart` is of posterior means, `poses_apart` of the published poses, which
+    are those of the heaviest modes; these and `type_apart` are None where they list other numbers of objects."""
+    indices = matched(first.objects, second.objects)
+    pairs = None if indices is None else [(first.objects[i], second.objects[j]) for i, j in indices]
     names = set(first.num_objects) | set(second.num_objects)
     return {
         "bag": bag,
         "frame": first.stamp_ns,
         "objects": [len(first.objects), len(second.objects)],
         "ess": [[round(float(share), 4) for share in run.ess] for run in (first, second)],
-        "means_apart": None if pairs is None else round(max((_apart(a, b) for a, b in pairs), default=0.0), 4),
-        "type_apart": None if pairs is None else round(max((_type_apart(a, b) for a, b in pairs), default=0.0), 5),
+        "means_apart": None if indices is None else _worst(_means_apart(first, i, second, j) for i, j in indices),
+        "poses_apart": None if pairs is None else _worst(_poses_apart(a, b) for a, b in pairs),
+        "type_apart": None if pairs is None else _worst(_type_apart(a, b) for a, b in pairs),
         "count_apart": round(max(abs(first.num_objects.get(n, 0) - second.num_objects.get(n, 0)) for n in names), 5),
         "log_evidence": [round(run.log_evidence, 3) for run in (first, second)],
     }
 
 
-def matched(
-    first: Sequence[ObjectEstimate], second: Sequence[ObjectEstimate]
-) -> list[tuple[ObjectEstimate, ObjectEstimate]] | None:
-    """The estimates of two runs that are nearest to each other; None where they are not equally many."""
+def matched(first: Sequence[ObjectEstimate], second: Sequence[ObjectEstimate]) -> list[tuple[int, int]] | None:
+    """Which estimates of two runs are nearest to each other; None where they are not equally many."""
     if len(first) != len(second):
         return None
     distance = [[float(np.linalg.norm(a.position - b.position)) for b in second] for a in first]
     rows, columns = linear_sum_assignment(np.reshape(distance, (len(first), len(second))))
-    return [(first[i], second[j]) for i, j in zip(rows, columns, strict=True)]
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
-def _apart(a: ObjectEstimate, b: ObjectEstimate) -> float:
-    """The largest difference of the positions along the camera's axes, in posterior standard deviations."""
+def _worst(differences: Iterator[float]) -> float:
+    return round(max(differences, default=0.0), 5)
+
+
+def position_moments(run: ScenePosterior, k: int) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Posterior mean and standard deviations of the position of the k-th object listed, given its type."""
+    samples = run.samples
+    own = (run.object_index == k) & (samples.type == run.types.index(run.objects[k].type))
+    weight = np.where(own, np.exp(samples.log_weight.astype(np.float64))[:, None], 0.0)
+    weight /= weight.sum()
+    mean = np.einsum("sm,sma->a", weight, samples.position)
+    return mean, np.sqrt(np.einsum("sm,sma->a", weight, (samples.position - mean) ** 2))
+
+
+def _means_apart(first: ScenePosterior, i: int, second: ScenePosterior, j: int) -> float:
+    """The largest difference of posterior means along the camera's axes, in posterior standard deviations."""
+    (a, sigma_a), (b, sigma_b) = position_moments(first, i), position_moments(second, j)
+    return float((np.abs(a - b) / np.maximum(np.sqrt(0.5 * (sigma_a**2 + sigma_b**2)), 1e-9)).max())
+
+
+def _poses_apart(a: ObjectEstimate, b: ObjectEstimate) -> float:
+    """The same of the published positions and standard deviations: two runs may call either of two modes heaviest."""
     sigma = np.sqrt(0.5 * (np.diag(a.covariance) + np.diag(b.covariance)))[:3]
     return float((np.abs(a.position - b.position) / np.maximum(sigma, 1e-9)).max())
 
@@ -87,9 +111,10 @@ def _type_apart(a: ObjectEstimate, b: ObjectEstimate) -> float:
 
 def line(row: Row) -> str:
     """A row, under HEADER."""
-    means, kind = ("-" if row[name] is None else f"{row[name]:.3f}" for name in ("means_apart", "type_apart"))
+    apart = ("means_apart", "poses_apart", "type_apart")
+    means, poses, kind = ("-" if row[name] is None else f"{row[name]:.3f}" for name in apart)
     ess = " | ".join(" ".join(f"{share:.2f}" for share in run) for run in row["ess"])
-    return f"{row['bag']:<18} {row['frame']:>20}  {means:>11} {kind:>8} {row['count_apart']:>6.3f}  {ess}"
+    return f"{row['bag']:<18} {row['frame']:>20}  {means:>11} {poses:>11} {kind:>8} {row['count_apart']:>6.3f}  {ess}"
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
@@ -102,7 +127,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "stages_below": sum(share < LEAST_ESS for share in ess),
         "other_numbers_listed": sum(row["means_apart"] is None for row in rows),
     }
-    for name in ("means_apart", "type_apart", "count_apart"):
+    for name in ("means_apart", "poses_apart", "type_apart", "count_apart"):
         told[f"worst_{name}"] = max((row[name] for row in rows if row[name] is not None), default=None)
     missed = {
         "ess": told["stages_below"] > 0,
@@ -127,7 +152,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
             means.plot(at, row["means_apart"], "o", color=shade, alpha=0.5, markersize=5)
     for axis, limit, title in (
         (stages, LEAST_ESS, "effective share of the particles, every stage"),
-        (means, APART, "positions of two runs apart, posterior sd, every frame"),
+        (means, APART, "posterior means of two runs apart, in posterior sd, every frame"),
     ):
         axis.set_title(title, loc="left", fontsize=10, color=INK)
         axis.axhline(limit, color=INK, linestyle="--", linewidth=1)
