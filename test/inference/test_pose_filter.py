@@ -9,7 +9,7 @@ import trimesh
 from scipy.stats import multivariate_t
 
 from bayes3d_ros.evaluation.agreement import ratio_and_error
-from bayes3d_ros.inference import camera_tracking as tracking
+from bayes3d_ros.inference import pose_filter as tracking
 from bayes3d_ros.inference.noise import for_returns, log_marginal, noise_grid
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_camera
 from bayes3d_ros.model.image import Image

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference.noise import NoiseGrid
@@ -298,38 +298,41 @@ def _aligned(
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """Gauss-Newton on the differences between observed and rendered depth; where it ends, and the scale of the errors
     left, if they are independent and as large as sigma."""
-    height, width = image.depth.shape
-    shape = (_RENDERED, height, width)
-    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
-    delta = jnp.array(_DELTA)
-    around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
-    valid = image.kind == IN_WORKSPACE
-
-    def linear(mean: Array) -> tuple[Array, Array, Array]:
-        """Residuals, slopes of the rendered depth, and where there are both."""
-        depth = render_cameras(chart.pose(mean + around), scene.world, scene.library, rays)
-        seen = valid & jnp.isfinite(depth).all(0)
-        depth = jnp.where(seen, depth, 0.0)
-        slope = (depth[1:7] - depth[7:]) / (2 * delta[:, None, None])
-        return jnp.where(seen, image.depth - depth[0], 0.0), slope, seen
 
     def information(slope: Array, weight: Array) -> Array:
         return jnp.einsum("ahw,hw,bhw->ab", slope, weight, slope, precision=jax.lax.Precision.HIGHEST)
 
     def one(mean: Array, reach: Array) -> tuple[Array, None]:
-        residual, slope, seen = linear(mean)
+        depth, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
+        residual = jnp.where(seen, image.depth - depth, 0.0)
         weight = jnp.where(seen, 1 / (1 + (residual / reach) ** 2) ** 2, 0.0) / reach**2
         pull = jnp.einsum("ahw,hw,hw->a", slope, weight, residual, precision=jax.lax.Precision.HIGHEST)
         square = information(slope * scale[:, None, None], weight) + 0.01 * jnp.eye(6)
         return mean + scale * jnp.linalg.solve(square, scale * pull), None
 
     mean, _ = jax.lax.scan(one, start, jnp.array(_REACH))
-    _, slope, seen = linear(mean)
+    _, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
     # With ones on the diagonal: metres and radians, and a prior a thousand times wider, are too much for float32.
     precision = information(slope, jnp.where(seen, 1 / sigma**2, 0.0)) + jnp.diag(1 / scale**2)
     unit = 1 / jnp.sqrt(jnp.diag(precision))
     covariance = jnp.linalg.inv(precision * unit[:, None] * unit + 1e-4 * jnp.eye(6))
     return mean, unit[:, None] * jnp.linalg.cholesky(covariance)
+
+
+def rendered_slopes(
+    pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]], at: Float[Array, "6"], image: Image, scene: Scene
+) -> tuple[Float[Array, "H W"], Float[Array, "6 H W"], Bool[Array, "H W"]]:
+    """Rendered depth at a tangent that `pose` makes a camera pose of, its slopes along the tangent, and where there
+    are both and a return; zero elsewhere."""
+    height, width = image.depth.shape
+    shape = (_RENDERED, height, width)
+    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
+    delta = jnp.array(_DELTA)
+    around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
+    depth = render_cameras(pose(at + around), scene.world, scene.library, rays)
+    seen = (image.kind == IN_WORKSPACE) & jnp.isfinite(depth).all(0)
+    depth = jnp.where(seen, depth, 0.0)
+    return depth[0], (depth[1:7] - depth[7:]) / (2 * delta[:, None, None]), seen
 
 
 def _propose(
