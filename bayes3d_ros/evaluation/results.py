@@ -31,12 +31,12 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "frame_id": posterior.frame_id,
         "size": [width, height],
         "seconds": round(float(posterior.seconds), 4),
-        "log_evidence": _number(posterior.log_evidence),
-        "num_objects": {str(n): _number(p) for n, p in posterior.num_objects.items()},
-        "noise": {"p_outlier": _number(posterior.p_outlier), "sigma": _number(posterior.sigma)},
+        "log_evidence": json_number(posterior.log_evidence),
+        "num_objects": {str(n): json_number(p) for n, p in posterior.num_objects.items()},
+        "noise": {"p_outlier": json_number(posterior.p_outlier), "sigma": json_number(posterior.sigma)},
         "objects": [_object_record(found) for found in posterior.objects],
-        "T_camera_table": _numbers(posterior.T_camera_table),
-        "ess": _numbers(posterior.ess),
+        "T_camera_table": json_numbers(posterior.T_camera_table),
+        "ess": json_numbers(posterior.ess),
         "notes": list(posterior.notes),
     }
 
@@ -44,23 +44,23 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
 def _object_record(found: ObjectEstimate) -> dict[str, Any]:
     return {
         "type": found.type,
-        "type_probabilities": {name: _number(p) for name, p in found.type_probabilities.items()},
-        "probability": _number(found.probability),
-        "position": _numbers(found.position),
-        "orientation": _numbers(found.orientation),
-        "covariance": _numbers(found.covariance),
+        "type_probabilities": {name: json_number(p) for name, p in found.type_probabilities.items()},
+        "probability": json_number(found.probability),
+        "position": json_numbers(found.position),
+        "orientation": json_numbers(found.orientation),
+        "covariance": json_numbers(found.covariance),
         "contact_face": int(found.contact_face),
-        "face_probabilities": _numbers(found.face_probabilities),
+        "face_probabilities": json_numbers(found.face_probabilities),
         "modes": [_mode_record(mode) for mode in found.modes],
     }
 
 
 def _mode_record(mode: PoseMode) -> dict[str, Any]:
     return {
-        "weight": _number(mode.weight),
-        "position": _numbers(mode.position),
-        "orientation": _numbers(mode.orientation),
-        "covariance": _numbers(mode.covariance),
+        "weight": json_number(mode.weight),
+        "position": json_numbers(mode.position),
+        "orientation": json_numbers(mode.orientation),
+        "covariance": json_numbers(mode.covariance),
         "contact_face": int(mode.contact_face),
     }
 
@@ -143,11 +143,11 @@ class ResultsWriter:
 _ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])
 
 
-def _number(value: float) -> float | None:
+def json_number(value: float) -> float | None:
     """Ten digits: more would only say how sums were ordered."""
     return float(f"{value:.10g}") if np.isfinite(value) else None
 
 
-def _numbers(values: Any) -> list[Any]:
+def json_numbers(values: Any) -> list[Any]:
     values = np.asarray(values, float)
-    return [_number(v) if values.ndim == 1 else _numbers(v) for v in values]
+    return [json_number(v) if values.ndim == 1 else json_numbers(v) for v in values]

@@ -3,12 +3,12 @@
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 
-from bayes3d_ros.model.posterior import ScenePosterior
 from bayes3d_ros.ros.summary import key_values
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -56,8 +56,7 @@ class Health:
         self._lock = threading.Lock()
         self._outputs: deque[float] = deque(maxlen=32)
         self._problem, self._problem_at, self._logged_at = "", 0.0, -1e9
-        self._posterior: ScenePosterior | None = None
-        self._latency = 0.0
+        self._latency, self._seconds, self._ess = 0.0, "", ""
         self.parsed, self.refused = 0, 0
         self.backend = ""
 
@@ -72,12 +71,14 @@ class Health:
             self._logged_at = now
             return True
 
-    def output(self, posterior: ScenePosterior, latency: float) -> None:
-        """Note an output and how many seconds after its image it came."""
+    def output(self, seconds: float, ess: Sequence[float], latency: float) -> None:
+        """Note an output: the seconds that inference took, effective shares of the particles, and how many seconds
+        after its image it came."""
         with self._lock:
             self.parsed += 1
             self._outputs.append(time.monotonic())
-            self._posterior, self._latency = posterior, latency
+            self._latency, self._seconds = latency, f"{seconds:.3f}"
+            self._ess = " ".join(f"{share:.2f}" for share in ess)
 
     def recent_problem(self) -> str:
         """The last problem, if no output has come since."""
@@ -91,18 +92,17 @@ class Health:
         """The message for /diagnostics, stamped with the system's time."""
         with self._lock:
             status = DiagnosticStatus(name=name, level=level, message=message, hardware_id=self.backend or "none")
-            posterior = self._posterior
             status.values = key_values(
                 state=state,
                 rate_hz=f"{self._rate():.2f}",
                 latency_s=f"{self._latency:.3f}",
-                parse_s="" if posterior is None else f"{posterior.seconds:.3f}",
+                parse_s=self._seconds,
                 received=str(received),
                 parsed=str(self.parsed),
                 refused=str(self.refused),
                 dropped=str(dropped),
                 backend=self.backend,
-                ess="" if posterior is None else " ".join(f"{e:.2f}" for e in posterior.ess),
+                ess=self._ess,
                 last_problem=self._problem,
                 notes=notes,
             )

@@ -245,7 +245,7 @@ class SceneParserNode(Node):
             self._problem(str(error))
             return
         self._outputs.scene(posterior, ready.parser.library, ready.markers)
-        self._health.output(posterior, time.monotonic() - messages.arrived)
+        self._health.output(posterior.seconds, posterior.ess, time.monotonic() - messages.arrived)
 
     def _worker_failed(self, error: Exception) -> None:
         self._problem(f"internal error, please report it: {_one_line(error)}")
