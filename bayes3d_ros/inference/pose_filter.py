@@ -29,15 +29,15 @@ from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 
 _FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
-_BLURS = (0.012, 0.003, 0.0)  # metres of sigma at least, round by round: before alignment, and after
-_ROUND_SHARE = 0.12  # of the hypotheses, each round
-_STARTS = 4  # of alignment
+_BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by round: before alignment, and after
+_ROUND_SHARE = 0.1  # of the hypotheses, each round
+_STARTS = 2  # of alignment
 _LEAST_OUTLIERS = 0.02  # p_outlier while searching: with less, one bad pixel decides
 _REACH = (0.03, 0.02, 0.01, 0.005, 0.003, 0.003)  # metres: residuals beyond count little, step by step
 _DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
 _RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
-_KEEP = 0.25  # share of a round's draws that stay effective when they are weighed
-_WIDEN = 1.5  # of the scale learned from a round, for the next
+_KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
+_WIDEN = 1.2  # of the scale learned from a round, for the next
 _FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
 _SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
 
@@ -72,6 +72,7 @@ class Info(NamedTuple):
 
     T_camera_world: Float[Array, "4 4"]  # the mean
     covariance: Float[Array, "6 6"]  # of (shift, turn) about the pivot, on the camera's axes
+    proposed: Float[Array, "6 6"]  # the same of the distribution that the search proposed
     log_evidence: Float[Array, ""]  # log p(image | images before) - log p(image | nothing in sight)
     ess: Float[Array, ""]  # fraction
     sigma: Float[Array, ""]
@@ -235,6 +236,7 @@ def step(
     return new, Info(
         mean,
         covariance,
+        _FREEDOM / (_FREEDOM - 2) * product(chart.scale, chart.scale.T),
         log_evidence - jnp.log(own),
         effective_fraction(log_weight),
         noise.sigma[0],

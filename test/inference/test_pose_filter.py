@@ -167,8 +167,8 @@ def test_a_camera_is_followed_and_its_covariance_holds(scene):
 
 
 def test_too_few_hypotheses_or_other_numbers_of_particles_are_refused(scene):
-    with pytest.raises(ValueError, match="at least 708"):
-        tracking.shares(500)
+    with pytest.raises(ValueError, match="at least 460"):
+        tracking.shares(400)
     grid, image = noise_grid(0.01), image_from(looking(0.1), scene, 0.001, np.random.default_rng(0))
     motion = tracking.Motion(jnp.float32(0.01), jnp.float32(0.03))
     state = tracking.start(looking(0.1), 10, 0.002)
