@@ -64,6 +64,7 @@ setup(
             "bayes3d = bayes3d_ros.cli:main",
             "scene_parser = bayes3d_ros.ros.scene_parser:main",
             "object_learner = bayes3d_ros.ros.object_learner:main",
+            "camera_tracker = bayes3d_ros.ros.camera_tracker:main",
             "bag_player = bayes3d_ros.ros.bag_player:main",
         ],
     },

@@ -14,6 +14,7 @@ from bayes3d_ros.evaluation.experiments import EXPERIMENTS
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.bags import FrameReader
     from bayes3d_ros.inference.settings import ParserSettings
+    from bayes3d_ros.model.camera_estimate import CameraEstimate
     from bayes3d_ros.model.objects import Library
     from bayes3d_ros.model.posterior import ScenePosterior
 
@@ -197,6 +198,64 @@ def learn(
     title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
     click.echo(f"{save_model(model, library)}")
     click.echo(f"{plot_model(model, library / f'{name}.png', title)}")
+
+
+@main.command()
+@click.argument("bag", type=ANY)
+@click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
+@click.option("--out", required=True, type=FOLDER, help="Folder for cameras.jsonl and track.png.")
+@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--hypotheses", type=int, help="Camera poses scored for every frame; default 1024.")
+@click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
+@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the tracker.")
+@_device_option
+def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
+    """Follow the camera of BAG around what its first frame shows."""
+    from bayes3d_ros.bags import read_frames
+    from bayes3d_ros.evaluation.tracking_results import PICTURE, TrackWriter, plot_track
+    from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
+    from bayes3d_ros.inference.compilation import enable_cache
+    from bayes3d_ros.inference.scene_parsing import SceneParser
+    from bayes3d_ros.inference.settings import TrackerSettings
+    from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
+    from bayes3d_ros.model.objects import load_library
+    from bayes3d_ros.model.posterior import ParseError
+
+    settings = _settings(TrackerSettings, more, options)
+    models = load_library(library)
+    frames = read_frames(bag, topic)
+    enable_cache()
+    follower = CameraFollower(CameraTracker(models, settings), SceneParser(models))
+    known: Tracking | None = None
+    done: list[CameraEstimate] = []
+    recorded, failed = [], 0
+    with TrackWriter(out) as results:
+        for frame in _progress(frames, len(frames), "frame"):
+            try:
+                known, estimate = follower.step(known, frame)
+            except (TrackingError, ParseError) as error:
+                failed += 1
+                _say(f"{bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+                continue
+            results.write(estimate)
+            done.append(estimate)
+            recorded.append(frame.T_table_camera)
+            _say(_camera_line(estimate))
+    if not done:
+        raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
+    lost = sum(bool(estimate.lost) for estimate in done)
+    told = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
+    told += f", {failed} could not be" if failed else ""
+    plot_track(done, out / PICTURE, f"{bag.name}   {frames.depth_topic}   {told}", recorded)
+    click.echo(f"{told}; results in {out}")
+
+
+def _camera_line(estimate: "CameraEstimate") -> str:
+    place = " ".join(f"{v:.4f}" for v in estimate.T_world_camera[:3, 3])
+    sure = 1e3 * estimate.covariance.diagonal()[:3].sum() ** 0.5
+    told = f"lost: {estimate.lost}" if estimate.lost else f"sd {sure:.1f} mm, {estimate.explained:.0%} explained"
+    again = ", searched for in the whole scene" if estimate.found_again else ""
+    return f"{estimate.stamp_ns}  {estimate.seconds:.2f} s  {place} m  {told}{again}"
 
 
 @main.command()

@@ -13,7 +13,8 @@ from click.testing import CliRunner
 
 from bayes3d_ros import cli
 from bayes3d_ros.bags import BagWriter
-from bayes3d_ros.inference import scene_parsing
+from bayes3d_ros.inference import camera_tracking, scene_parsing
+from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import load_library, save_model
 from bayes3d_ros.model.posterior import ParseError
@@ -43,7 +44,7 @@ def parsers(monkeypatch, fake_posterior):
     class Parser:
         failing: set = set()
 
-        def __init__(self, models, settings):
+        def __init__(self, models, settings=None):
             self.models, self.settings, self.warm = models, settings, []
             made.append(self)
 
@@ -287,3 +288,76 @@ def test_learn_says_in_one_line_what_is_wrong(tmp_path, options, message):
     result = CliRunner().invoke(cli.main, ["learn", str(bag), "--library", str(tmp_path / "library"), *options])
     assert result.exit_code == 2 and message in result.output and result.output.count("\n") == 1
     assert not (tmp_path / "library").exists()
+
+
+@pytest.fixture
+def followers(monkeypatch, parsers):
+    """A stand-in for the tracker: one metre above the world, lost on the stamps in `lost`, raising on those in
+    `failing`."""
+    told = SimpleNamespace(lost=set(), failing=set(), settings=[])
+
+    class Tracker:
+        def __init__(self, models, settings):
+            told.settings.append(settings)
+
+    class Follower:
+        def __init__(self, tracker, parser):
+            pass
+
+        def step(self, known, frame):
+            if frame.stamp_ns in told.failing:
+                raise TrackingError("no object in sight to track the camera by")
+            T = np.eye(4)
+            T[:3, 3] = 0.1 * frame.stamp_ns, 0.0, 1.0
+            lost = "out of sight" if frame.stamp_ns in told.lost else ""
+            numbers = {"explained": 0.9, "in_sight": 50, "log_evidence": 5.0, "ess": 0.5, "p_outlier": 0.1}
+            return object(), CameraEstimate(
+                frame.stamp_ns, frame.frame_id, T, np.eye(6) * 1e-6, T[None], np.zeros(1), sigma=0.001, seconds=0.1,
+                lost=lost, found_again=known is None, **numbers,
+            )  # fmt: skip
+
+    monkeypatch.setattr(camera_tracking, "CameraTracker", Tracker)
+    monkeypatch.setattr(camera_tracking, "CameraFollower", Follower)
+    return told
+
+
+def test_track_writes_a_line_a_frame_and_a_picture(bag, library, followers, tmp_path):
+    followers.lost.add(2)
+    out = tmp_path / "out"
+    result = run("track", bag, "--library", library, "--out", out, "--hypotheses", 700, "--set", "table=false")
+    assert result.exit_code == 0, result.output
+    assert (followers.settings[0].hypotheses, followers.settings[0].table) == (700, False)
+    lines = [json.loads(text) for text in (out / "cameras.jsonl").read_text().splitlines()]
+    assert [line["stamp_ns"] for line in lines] == [1, 2, 3]
+    assert [bool(line["lost"]) for line in lines] == [False, True, False]
+    assert [line["found_again"] for line in lines] == [True, False, False]
+    keys = (
+        "frame_id",
+        "position",
+        "orientation",
+        "covariance",
+        "explained",
+        "in_sight",
+        "log_evidence",
+        "ess",
+        "noise",
+    )
+    assert {"stamp_ns", "lost", "found_again", "seconds", *keys} == set(lines[0])
+    assert lines[2]["position"] == pytest.approx([0.3, 0, 1]) and lines[0]["orientation"] == [0, 0, 0, 1]
+    assert np.shape(lines[0]["covariance"]) == (6, 6)
+    assert "lost: out of sight" in result.stdout and "3 frames tracked, lost in 1" in result.stdout
+    assert (out / "track.png").stat().st_size > 10_000
+
+
+def test_track_goes_on_after_a_frame_that_fails_and_fails_if_all_do(bag, library, followers, tmp_path):
+    followers.failing.add(1)
+    result = run("track", bag, "--library", library, "--out", tmp_path / "out")
+    assert result.exit_code == 0 and "2 frames tracked, 1 could not be" in result.stdout
+    assert "stamp 1: no object in sight" in result.stderr
+    followers.failing.update((2, 3))
+    result = run("track", bag, "--library", library, "--out", tmp_path / "out")
+    assert result.exit_code == 1 and "3 of 3 frames failed" in result.stderr
+    assert not (tmp_path / "out" / "track.png").exists()
+    assert_one_line(
+        run("track", bag, "--library", library, "--out", tmp_path / "o", "--hypotheses", 9), 2, "hypotheses"
+    )

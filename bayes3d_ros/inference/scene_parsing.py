@@ -75,7 +75,7 @@ class SceneParser:
             self.parse(frame)
             image, table, *_ = self._observe(frame)
             context, grid = self._context(image, table)
-            self._refreshed(_frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
+            self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
         rays = jnp.zeros((height, width))
         self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
 
@@ -85,7 +85,7 @@ class SceneParser:
         settings = self.settings
         image, table, T_camera_table, notes = self._observe(frame)
         context, grid = self._context(image, table)
-        stages, ess = self._sample(_frame_key(settings.seed, frame.stamp_ns), context, grid)
+        stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, grid)
         samples, log_evidence = self._mix(stages, table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
         reconstruction, segmentation = self._reconstruct(frame, T_camera_table, samples, summary)
@@ -308,7 +308,7 @@ class SceneParser:
         return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels
 
 
-def _frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:
+def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:
     """A frame's random numbers depend on the seed and its own stamp: seconds, then nanoseconds."""
     key = jax.random.key(seed)
     return jax.random.fold_in(jax.random.fold_in(key, stamp_ns // 10**9 % 2**32), stamp_ns % 10**9)

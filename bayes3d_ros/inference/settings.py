@@ -118,3 +118,52 @@ class LearnerSettings:
         validate(self)
         if self.near >= self.far:
             raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Settings of the camera tracker."""
+
+    hypotheses: int = setting(
+        1024, "camera poses rendered and scored for every frame; a third are the filter's own", low=460, high=1000000
+    )
+    score_width: int = setting(40, "width of the image that is scored", unit="px", low=8, high=1280)
+    window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
+    sigma_max: float = setting(
+        0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
+    )
+    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
+    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
+    table: bool = setting(True, "whether the table is seen too, and not only the objects on it")
+    speed_change: float = setting(
+        0.3, "by how much the camera's velocity may change from frame to frame", unit="m/s", low=0.001, high=100.0
+    )
+    turn_change: float = setting(
+        0.9, "by how much its angular velocity may change from frame to frame", unit="rad/s", low=0.001, high=100.0
+    )
+    frame_time: float = setting(
+        0.033, "time between frames where there is no earlier one", unit="s", low=0.001, high=10.0
+    )
+    longest_gap: float = setting(
+        1.0, "after so long without a frame the camera is looked for anew", unit="s", low=0.01, high=60.0
+    )
+    least_explained: float = setting(
+        0.5, "share of the objects' pixels that have to be explained, or the camera is lost", low=0.0, high=1.0
+    )
+    depth_bias: float = setting(
+        0.0015, "standard deviation of depth errors that all pixels share", unit="m", low=0.0, high=0.05
+    )
+    depth_waviness: float = setting(
+        0.0017, "standard deviation of depth errors that are waves over surfaces", unit="m", low=0.0, high=0.05
+    )
+    waviness_length: float = setting(
+        0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
+    )
+    seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.window % 2 == 0:
+            raise ValueError(f"window must be odd, got {self.window}")
+        if self.near >= self.far:
+            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
@@ -13,6 +13,7 @@ from std_msgs.msg import Header, String
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.model.camera_estimate import CameraEstimate
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ScenePosterior
 from bayes3d_ros.model.summaries import posterior_rows
@@ -95,6 +96,30 @@ def pose_array(posterior: ScenePosterior) -> PoseArray:
     """The poses of the best scene; pose k is of the object labelled k + 1."""
     poses = [pose_message(o.position, o.orientation) for o in posterior.objects]
     return PoseArray(header=header(posterior), poses=poses)
+
+
+def camera_pose(estimate: CameraEstimate, world_frame: str) -> PoseWithCovarianceStamped:
+    """The camera's pose in the world, at the image's stamp; covariance of x y z and turns about the world's axes."""
+    message = PoseWithCovarianceStamped(header=Header(stamp=ns_to_stamp(estimate.stamp_ns), frame_id=world_frame))
+    message.pose.pose = matrix_to_pose(estimate.T_world_camera)
+    message.pose.covariance = estimate.covariance.ravel().tolist()
+    return message
+
+
+def camera_particles(estimate: CameraEstimate, world_frame: str, most: int) -> PoseArray:
+    """Up to `most` poses of equal weight: particles drawn systematically by their weights."""
+    weight = np.exp(estimate.log_weight.astype(np.float64))
+    count = min(most, len(weight))
+    drawn = np.searchsorted(np.cumsum(weight) / weight.sum(), (np.arange(count) + 0.5) / count)
+    message = PoseArray(header=Header(stamp=ns_to_stamp(estimate.stamp_ns), frame_id=world_frame))
+    message.poses = [matrix_to_pose(estimate.particles[k]) for k in drawn]
+    return message
+
+
+def path_pose(estimate: CameraEstimate, world_frame: str) -> PoseStamped:
+    """A place on the camera's path."""
+    stamp = Header(stamp=ns_to_stamp(estimate.stamp_ns), frame_id=world_frame)
+    return PoseStamped(header=stamp, pose=matrix_to_pose(estimate.T_world_camera))
 
 
 def image_message(pixels: np.ndarray, encoding: str, image_header: Header) -> Image:

@@ -12,7 +12,7 @@ from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeExce
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bayes3d_ros.inference.settings import LearnerSettings, ParserSettings, setting, validate
+from bayes3d_ros.inference.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 from bayes3d_ros.ros.conversions import matrix_from_values
 
 Settings = TypeVar("Settings")
@@ -65,9 +65,23 @@ class ObjectLearnerNodeSettings(DepthInputSettings):
     )
 
 
+@dataclass(frozen=True)
+class CameraTrackerNodeSettings(DepthInputSettings):
+    """What the camera_tracker node needs beside the tracker's own settings."""
+
+    library: str = setting("", "folder of object models (bayes3d import); read when the node starts and on ~/reset")
+    path_length: int = setting(1000, "poses kept on ~/path", low=1, high=1000000)
+    most_particles: int = setting(200, "poses on ~/particles, drawn from the filter's", low=1, high=100000)
+
+
 SCENE_PARSER_SETTINGS: tuple[type, ...] = (SceneParserNodeSettings, ParserSettings)
 OBJECT_LEARNER_SETTINGS: tuple[type, ...] = (ObjectLearnerNodeSettings, LearnerSettings)
-NODE_SETTINGS = {"scene_parser": SCENE_PARSER_SETTINGS, "object_learner": OBJECT_LEARNER_SETTINGS}
+CAMERA_TRACKER_SETTINGS: tuple[type, ...] = (CameraTrackerNodeSettings, TrackerSettings)
+NODE_SETTINGS = {
+    "scene_parser": SCENE_PARSER_SETTINGS,
+    "object_learner": OBJECT_LEARNER_SETTINGS,
+    "camera_tracker": CAMERA_TRACKER_SETTINGS,
+}
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
 
 

@@ -1,0 +1,326 @@
+"""Follow a camera through a known world, frame by frame; find it again when it is lost."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
+
+from bayes3d_ros.geometry.camera import resize_depth, trustworthy, unproject
+from bayes3d_ros.inference import pose_filter
+from bayes3d_ros.inference.camera_errors import pose_covariance
+from bayes3d_ros.inference.noise import for_returns, noise_grid
+from bayes3d_ros.inference.registration import SmoothError
+from bayes3d_ros.inference.scene_parsing import SceneParser, frame_key
+from bayes3d_ros.inference.settings import TrackerSettings
+from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_camera
+from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.library_arrays import library_arrays
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ScenePosterior
+
+_NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
+_NEAR_OBJECT = 0.08  # metres from an object's sphere in which a return may still be its own
+_OUT_OF_SIGHT = 12  # pixels: with fewer there is nothing to follow
+_EXPLAINED = (0.006, 0.01)  # metres, and share of the depth, within which a return lies where the world puts it
+_STEEP = 5.0  # slope of depth against a shift, from which it is an outline's and no surface's
+_OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.py`)
+_ARM = 0.03  # metres, that they hold a turn by at least
+_CANDIDATES = 64  # poses that a parsed scene may suggest
+_ROUGH = Noise(jnp.array([0.006]), jnp.array([0.1]))  # at which those are compared
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """What is known between two frames."""
+
+    world: KnownWorld
+    scene: pose_filter.Scene
+    particles: pose_filter.State
+    stamp_ns: int | None = None  # of the last frame
+    frame_time: float = 0.0  # seconds between the last two frames
+    lost: str = ""  # why the last frame's pose is not to be trusted
+
+
+class CameraTracker:
+    """Holds a library and compiled code; what is known of a camera is handed in and out, frame by frame.
+
+    Compiled once for the images' size and the number of objects in the world.
+    """
+
+    def __init__(self, library: Library, settings: TrackerSettings = TrackerSettings()) -> None:
+        self.library, self.settings = library, settings
+        self._arrays = library_arrays(library)
+        self._grid = noise_grid(settings.sigma_max)
+        bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
+        self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
+        self._smooth = jax.jit(_smooth_covariance)
+        self._render = jax.jit(render_camera)
+
+    def start(self, world: KnownWorld, T_world_camera: Float[np.ndarray, "4 4"]) -> Tracking:
+        """A camera at rest at a pose that is roughly known. Raises TrackingError for a world without objects, or with
+        ones that the library lacks."""
+        if not world.types:
+            raise TrackingError("no object in sight to track the camera by")
+        missing = sorted(set(world.types) - set(self.library.names))
+        if missing:
+            raise TrackingError(f"expected objects of the library, it has no {', '.join(missing)}")
+        kind = jnp.array([self.library.names.index(name) for name in world.types], jnp.int32)
+        placed = jnp.asarray(world.T_world_object, jnp.float32)
+        pivot = jnp.asarray(self._centres(world).mean(0), jnp.float32)
+        scene = pose_filter.Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
+        return Tracking(world, scene, self._at_rest(T_world_camera))
+
+    def _at_rest(self, T_world_camera: Float[np.ndarray, "4 4"]) -> pose_filter.State:
+        _, own = pose_filter.shares(self.settings.hypotheses)
+        T_camera_world = jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32)
+        return pose_filter.start(T_camera_world, own, 0.4 * self.settings.sigma_max)
+
+    def step(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        """The posterior one frame later. Raises TrackingError for a frame without returns, or one that is not newer
+        than the last."""
+        began = time.perf_counter()
+        settings = self.settings
+        seconds, ratio = settings.frame_time, 1.0
+        if known.stamp_ns is not None:
+            seconds = 1e-9 * (frame.stamp_ns - known.stamp_ns)
+            if seconds <= 0:
+                raise TrackingError(f"stamp {frame.stamp_ns} is not after the last one, {known.stamp_ns}")
+            if known.frame_time:
+                ratio = seconds / known.frame_time
+        before = known.particles
+        if abs(ratio - 1) > 0.02:
+            before = before._replace(motion=_slower(before.motion, jnp.float32(ratio)))
+        expected = product(before.motion, before.T_camera_world)[jnp.argmax(before.log_weight)]
+        image = self._image(frame, known.world, np.asarray(expected, np.float64))
+        grid = for_returns(self._grid, image.kind)
+        motion = pose_filter.Motion(
+            jnp.float32(settings.speed_change * seconds), jnp.float32(settings.turn_change * seconds)
+        )
+        key = frame_key(settings.seed, frame.stamp_ns)
+        particles, info = pose_filter.step(
+            key, before, image, known.scene, grid, motion, settings.hypotheses, settings.window
+        )
+        smooth, explained, in_sight = self._smooth(info.T_camera_world, image, known.scene, self._error)
+        T_camera_world, log_weight, info, smooth, explained, in_sight = jax.device_get(
+            (particles.T_camera_world, particles.log_weight, info, smooth, explained, in_sight)
+        )
+        T_world_camera, covariance = _moments(T_camera_world, log_weight)
+        # A mean over few effective particles is itself off by what they were drawn from.
+        sampled = info.proposed / (info.ess * len(log_weight))
+        covariance += _carried(info.T_camera_world, np.asarray(known.scene.pivot), smooth + sampled)
+        estimate = CameraEstimate(
+            stamp_ns=frame.stamp_ns,
+            frame_id=frame.frame_id,
+            T_world_camera=T_world_camera,
+            covariance=covariance,
+            particles=np.linalg.inv(T_camera_world.astype(np.float64)),
+            log_weight=log_weight,
+            explained=float(explained),
+            in_sight=int(in_sight),
+            log_evidence=float(info.log_evidence),
+            ess=float(info.ess),
+            p_outlier=float(info.p_outlier),
+            sigma=float(info.sigma),
+            seconds=time.perf_counter() - began,
+        )
+        lost = self._why_lost(estimate)
+        estimate = replace(estimate, lost=lost)
+        return replace(known, particles=particles, stamp_ns=frame.stamp_ns, frame_time=seconds, lost=lost), estimate
+
+    def _why_lost(self, estimate: CameraEstimate) -> str:
+        if estimate.in_sight < _OUT_OF_SIGHT:
+            return f"the world's objects are out of sight ({estimate.in_sight} pixels)"
+        if estimate.explained < self.settings.least_explained:
+            return f"only {estimate.explained:.0%} of the objects' {estimate.in_sight} pixels are where they should be"
+        if estimate.log_evidence <= 0:
+            return f"the image is explained better by nothing in sight (log evidence {estimate.log_evidence:.0f})"
+        return ""
+
+    def relocalise(self, known: Tracking, posterior: ScenePosterior, frame: DepthFrame) -> Tracking:
+        """The camera where a parsed scene of this frame says, in the same world: the likeliest of all poses that put a
+        parsed object on a known one of its type. Raises TrackingError where there is none."""
+        suggested = list(_suggested(known.world, posterior))
+        if not suggested:
+            seen = ", ".join(o.type for o in posterior.objects) or "no object"
+            raise TrackingError(f"expected one of {', '.join(sorted(set(known.world.types)))} in sight, found {seen}")
+        best, best_score = suggested[0], -np.inf
+        for first in range(0, len(suggested), _CANDIDATES):
+            some = suggested[first : first + _CANDIDATES]
+            padded = np.linalg.inv(np.stack(some + some[:1] * (_CANDIDATES - len(some))))
+            image = self._image(frame, known.world, padded[0])
+            scores = log_likelihood_of_cameras(
+                jnp.asarray(padded, jnp.float32), known.scene.world, image, self._arrays, _ROUGH, self.settings.window
+            )
+            value = np.asarray(scores)[: len(some), 0, 0]
+            if value.max() > best_score:
+                best, best_score = some[int(value.argmax())], float(value.max())
+        return replace(known, particles=self._at_rest(best), stamp_ns=None, frame_time=0.0, lost="")
+
+    def _centres(self, world: KnownWorld) -> Float[np.ndarray, "K 3"]:
+        """Middles of the objects' boxes, in the world."""
+        models = [self.library.models[self.library.names.index(name)] for name in world.types]
+        local = np.stack([m.T_object_box[:3, 3] for m in models])
+        return np.einsum("kab,kb->ka", world.T_world_object[:, :3, :3], local) + world.T_world_object[:, :3, 3]
+
+    def _image(self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]) -> Image:
+        """The image at scoring resolution. What lies neither near the table nor near an object, as far as the expected
+        pose tells, is none of the world's: not scored where there is a table, else beyond the objects."""
+        settings = self.settings
+        width = min(settings.score_width, frame.intrinsics.width)
+        height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
+        camera = frame.intrinsics.subsampled(width, height)
+        depth = resize_depth(frame.depth, width, height)
+        with np.errstate(invalid="ignore"):
+            returned = np.isfinite(depth) & (depth >= settings.near) & (depth <= settings.far)
+        returned &= trustworthy(frame.depth, width, height)
+        if not returned.any():
+            raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
+        points = unproject(np.where(returned, depth, np.nan), camera)
+        rays = camera.rays()
+        return Image(
+            depth=jnp.asarray(np.where(returned, depth, 0.0), jnp.float32),
+            kind=jnp.asarray(self._kinds(points, world, T_camera_world), jnp.int32),
+            ray_x=jnp.asarray(rays[0, :, 0]),
+            ray_y=jnp.asarray(rays[:, 0, 1]),
+            focal=jnp.array([camera.fx, camera.fy], jnp.float32),
+            centre=jnp.array([camera.cx, camera.cy], jnp.float32),
+            table=jnp.full((height, width), jnp.inf),
+            outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
+            front_margin=jnp.float32(3 * settings.sigma_max),
+        )
+
+    def _kinds(
+        self, points: Float[np.ndarray, "H W 3"], world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]
+    ) -> np.ndarray:
+        returned = np.isfinite(points[..., 2])
+        near = np.zeros(returned.shape, bool)
+        for centre, name in zip(self._centres(world), world.types, strict=True):
+            middle = T_camera_world[:3, :3] @ centre + T_camera_world[:3, 3]
+            reach = 0.5 * np.linalg.norm(self.library.models[self.library.names.index(name)].box_size) + _NEAR_OBJECT
+            with np.errstate(invalid="ignore"):
+                near |= ((points - middle) ** 2).sum(-1) < reach**2
+        if world.table:
+            height = (points - T_camera_world[:3, 3]) @ T_camera_world[:3, 2]
+            with np.errstate(invalid="ignore"):
+                near |= np.abs(height) < _NEAR_TABLE[0] + _NEAR_TABLE[1] * points[..., 2]
+            return np.where(near, IN_WORKSPACE, NO_RETURN)
+        return np.where(returned, np.where(near, IN_WORKSPACE, BEYOND), NO_RETURN)
+
+
+class CameraFollower:
+    """A tracker with a parser, which finds the world in the first frame and the camera when it is lost."""
+
+    def __init__(self, tracker: CameraTracker, parser: SceneParser) -> None:
+        self.tracker, self.parser = tracker, parser
+
+    def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        """One frame, the first one where nothing is known yet. Raises TrackingError or ParseError, and then what was
+        known still is."""
+        settings = self.tracker.settings
+        if known is None:
+            posterior = self.parser.parse(frame)
+            world, T_world_camera = world_of(posterior, settings.table)
+            found, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
+            return found, replace(estimate, found_again=True)
+        late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > settings.longest_gap
+        if not late:
+            now, estimate = self.tracker.step(known, frame)
+            if not estimate.lost:
+                return now, estimate
+        found = self.tracker.relocalise(known, self.parser.parse(frame), frame)
+        now, estimate = self.tracker.step(found, frame)
+        return now, replace(estimate, found_again=True)
+
+
+def world_of(posterior: ScenePosterior, table: bool) -> tuple[KnownWorld, Float[np.ndarray, "4 4"]]:
+    """The objects of a parsed scene at rest in the table's frame, and T_world_camera."""
+    T_world_camera = np.linalg.inv(posterior.T_camera_table)
+    placed = np.array([T_world_camera @ _matrix(o.position, o.orientation) for o in posterior.objects])
+    return KnownWorld(tuple(o.type for o in posterior.objects), placed.reshape(-1, 4, 4), table), T_world_camera
+
+
+def _suggested(world: KnownWorld, posterior: ScenePosterior) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """T_world_camera that put some mode of a parsed object on a known object of its type."""
+    for found in posterior.objects:
+        poses = [(m.position, m.orientation) for m in found.modes] or [(found.position, found.orientation)]
+        for name, T_world_object in zip(world.types, world.T_world_object, strict=True):
+            if name == found.type:
+                for position, orientation in poses:
+                    yield T_world_object @ np.linalg.inv(_matrix(position, orientation))
+
+
+def _matrix(position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(orientation).as_matrix(), position
+    return T
+
+
+@jax.jit
+def _slower(motion: Float[Array, "N 4 4"], ratio: Float[Array, ""]) -> Float[Array, "N 4 4"]:
+    """What the same velocity does in `ratio` times the time."""
+    zero = jnp.zeros(3)
+    return pose_filter.exp_about(ratio * pose_filter.log_about(motion, zero), zero)
+
+
+def _smooth_covariance(
+    T_camera_world: Float[Array, "4 4"], image: Image, scene: pose_filter.Scene, error: SmoothError
+) -> tuple[Float[Array, "6 6"], Float[Array, ""], Float[Array, ""]]:
+    """What smooth errors add to the covariance of (shift, turn) about the pivot, on the camera's axes; the share of the
+    objects' pixels that are explained, and how many there are."""
+    pivot = (T_camera_world[:3, :3] * scene.pivot).sum(-1) + T_camera_world[:3, 3]
+
+    def pose(tangent: Array) -> Array:
+        return product(pose_filter.exp_about(tangent, pivot), T_camera_world)
+
+    depth, slope, seen = pose_filter.rendered_slopes(pose, jnp.zeros(6), image, scene)
+    rays = jnp.broadcast_to(image.ray_x, depth.shape), jnp.broadcast_to(image.ray_y[:, None], depth.shape)
+    points = depth[..., None] * jnp.stack([*rays, jnp.ones_like(depth)], -1)
+    inner = seen & (jnp.abs(slope[:3]).max(0) < _STEEP)
+    covariance = pose_covariance(jnp.where(inner, slope, 0.0), inner, points, error)
+    alone = render_camera(T_camera_world, scene.world._replace(table=jnp.asarray(False)), scene.library, rays)
+    own = jnp.isfinite(alone) & (alone < jnp.where(seen, depth, jnp.inf) + 1e-3) & (image.kind != NO_RETURN)
+    near = jnp.abs(image.depth - alone) < _EXPLAINED[0] + _EXPLAINED[1] * alone
+    count = own.sum()
+    apart = jnp.where(own, ((points - pivot)[..., :2] ** 2).sum(-1), 0.0)
+    arm = jnp.sqrt(apart.sum() / jnp.maximum(count, 1) + _ARM**2)
+    outline = _OUTLINE * pivot[2] / image.focal[0]
+    across = jnp.array([outline, outline, 0.0, 0.0, 0.0, outline / arm])
+    covariance = covariance + jnp.where((error.bias > 0) | (error.waviness > 0), jnp.diag(across**2), 0.0)
+    return covariance, (own & near).sum() / jnp.maximum(count, 1), count
+
+
+def _moments(
+    T_camera_world: Float[np.ndarray, "N 4 4"], log_weight: Float[np.ndarray, "N"]
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
+    """Mean T_world_camera and covariance, on the world's axes."""
+    T = np.linalg.inv(T_camera_world.astype(np.float64))
+    weight = np.exp(log_weight.astype(np.float64))
+    weight /= weight.sum()
+    mean = np.eye(4)
+    turns = Rotation.from_matrix(T[:, :3, :3])
+    mean[:3, 3], middle = weight @ T[:, :3, 3], turns.mean(weight)
+    mean[:3, :3] = middle.as_matrix()
+    off = np.concatenate([T[:, :3, 3] - mean[:3, 3], (turns * middle.inv()).as_rotvec()], 1)
+    return mean, np.einsum("n,na,nb->ab", weight, off, off)
+
+
+def _carried(
+    T_camera_world: Float[np.ndarray, "4 4"], pivot: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "6 6"]:
+    """A covariance of (shift, turn) about the pivot, on the camera's axes, as one of the camera in the world.
+
+    With W = Exp(turn) about c, the pivot in the camera, the camera's place in the world becomes
+    -(W R)^T (W (t - c) + c + shift) and its orientation R^T W^T: slopes -R^T and -R^T [c]_x, and -R^T."""
+    R = T_camera_world[:3, :3].astype(np.float64)
+    c = R @ pivot + T_camera_world[:3, 3]
+    cross = np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
+    jacobian = np.block([[-R.T, -R.T @ cross], [np.zeros((3, 3)), -R.T]])
+    return jacobian @ covariance.astype(np.float64) @ jacobian.T

@@ -1,0 +1,184 @@
+"""A camera followed through frames: found, lost, found again, and what is refused; its covariance."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.inference import camera_tracking, pose_filter
+from bayes3d_ros.inference.camera_errors import pose_covariance
+from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker
+from bayes3d_ros.inference.registration import SmoothError
+from bayes3d_ros.inference.settings import TrackerSettings
+from bayes3d_ros.model.camera_estimate import KnownWorld, TrackingError
+from bayes3d_ros.model.camera_score import World, render_camera
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ObjectEstimate
+
+CAMERA = Intrinsics(32.0, 32.0, 15.5, 11.5, 32, 24)
+SIGMA, STEP = 0.001, 33_000_000
+_render = jax.jit(render_camera)
+
+
+@pytest.fixture(scope="module")
+def tracker():
+    """Of a block with a tower on it: no symmetry."""
+    base = trimesh.creation.box((0.16, 0.10, 0.06)).apply_translation((0, 0, 0.03))
+    tower = trimesh.creation.box((0.05, 0.06, 0.12)).apply_translation((-0.04, 0.01, 0.12))
+    model = model_from_mesh(trimesh.util.concatenate([base, tower]), "thing", 0.006)
+    return CameraTracker(Library((model,)), TrackerSettings(score_width=32))
+
+
+@pytest.fixture(scope="module")
+def world():
+    T = np.eye(4)
+    T[:3, 3] = 0.03, -0.02, 0.0
+    return KnownWorld(("thing",), T[None], True)
+
+
+def looking(azimuth, distance=0.45):
+    """T_world_camera of a camera that looks down at the world's origin."""
+    eye = distance * np.array([np.cos(azimuth) * 0.8, np.sin(azimuth) * 0.8, 0.6])
+    z = -eye / np.linalg.norm(eye)
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    T[:3, 3] = eye
+    return T
+
+
+@pytest.fixture(scope="module")
+def frame(tracker, world):
+    """frame(k, T_world_camera, objects=True): what that camera sees, with normal noise."""
+
+    def made(k, T_world_camera, objects=True):
+        rays = CAMERA.rays()
+        placed = world.T_world_object.copy()
+        placed[:, 2, 3] += 0.0 if objects else 50.0
+        scene = World(jnp.array([0]), jnp.asarray(placed, jnp.float32), jnp.asarray(True))
+        pair = jnp.asarray(rays[..., 0]), jnp.asarray(rays[..., 1])
+        depth = np.array(_render(jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32), scene, tracker._arrays, pair))
+        depth += SIGMA * np.random.default_rng(k).normal(size=depth.shape)
+        depth[~np.isfinite(depth)] = np.nan
+        return DepthFrame(depth.astype(np.float32), CAMERA, 10**9 + k * STEP, "camera")
+
+    return made
+
+
+def off(estimate, truth):
+    """Metres and radians."""
+    turn = Rotation.from_matrix(estimate.T_world_camera[:3, :3] @ truth[:3, :3].T).as_rotvec()
+    return np.concatenate([estimate.T_world_camera[:3, 3] - truth[:3, 3], turn])
+
+
+def parsed(world, T_world_camera, frame):
+    """A posterior that shows the world's objects from there."""
+    T = np.linalg.inv(T_world_camera)
+    found = [T @ placed for placed in world.T_world_object]
+    objects = tuple(
+        ObjectEstimate("thing", {"thing": 1.0}, 1.0, t[:3, 3], Rotation.from_matrix(t[:3, :3]).as_quat(), np.eye(6), 4)
+        for t in found
+    )
+    return SimpleNamespace(objects=objects, T_camera_table=T)
+
+
+def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
+    calls = []
+
+    def parse(seen):
+        calls.append(seen.stamp_ns)
+        return parsed(world, poses[round((seen.stamp_ns - 10**9) / STEP)], seen)
+
+    poses = [looking(0.3 + 0.02 * k) for k in range(9)] + [looking(2.2)]
+    follower = CameraFollower(tracker, SimpleNamespace(parse=parse))
+    known, estimate = follower.step(None, frame(0, poses[0]))
+    assert estimate.found_again and calls == [10**9] and known.world.types == ("thing",)
+    compiled, distances = pose_filter.step._cache_size(), []
+    for k in range(1, 8):
+        known, estimate = follower.step(known, frame(k, poses[k]))
+        assert not estimate.lost and not estimate.found_again and estimate.frame_id == "camera"
+        error = off(estimate, poses[k])
+        assert np.abs(error[:3]).max() < 0.006 and np.abs(error[3:]).max() < 0.02
+        distances.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert calls == [10**9] and pose_filter.step._cache_size() == compiled
+    assert np.median(distances) < 12.6  # the 95 % quantile of a chi-square with six degrees of freedom
+    assert np.exp(estimate.log_weight).sum() == pytest.approx(1, abs=1e-3)
+    gone = frame(8, poses[8], objects=False)
+    _, alone = tracker.step(known, gone)
+    assert "objects' " in alone.lost and "pixels are where they should be" in alone.lost
+    known, estimate = follower.step(known, frame(9, poses[9]))  # a jump that no motion explains
+    assert estimate.found_again and not estimate.lost and len(calls) == 2
+    assert np.abs(off(estimate, poses[9])[:3]).max() < 0.006
+
+
+def test_after_a_long_gap_the_camera_is_looked_for(tracker, world, frame):
+    there = looking(-0.8)
+    follower = CameraFollower(tracker, SimpleNamespace(parse=lambda seen: parsed(world, there, seen)))
+    known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9 - 2 * 10**9)
+    known, estimate = follower.step(known, frame(0, there))
+    assert estimate.found_again and not estimate.lost
+
+
+def test_what_cannot_be_tracked_is_refused_in_a_line(tracker, world, frame):
+    with pytest.raises(TrackingError, match="no object in sight"):
+        tracker.start(KnownWorld((), np.zeros((0, 4, 4)), True), np.eye(4))
+    with pytest.raises(TrackingError, match="the library, it has no cup"):
+        tracker.start(KnownWorld(("cup",), np.eye(4)[None], True), np.eye(4))
+    known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9)
+    with pytest.raises(TrackingError, match="not after the last one"):
+        tracker.step(known, frame(0, looking(0.3)))
+    blank = replace(frame(1, looking(0.3)), depth=np.full((24, 32), np.nan, np.float32))
+    with pytest.raises(TrackingError, match="no return between 0.1 and 5.0 m"):
+        tracker.step(known, blank)
+    with pytest.raises(TrackingError, match="expected one of thing in sight, found no object"):
+        tracker.relocalise(known, SimpleNamespace(objects=()), blank)
+
+
+def test_a_motion_is_scaled_with_the_time_between_frames():
+    quarter = pose_filter.exp_about(jnp.array([[0.1, -0.05, 0.02, 0.2, 0.1, -0.3]]), jnp.zeros(3))
+    whole = camera_tracking._slower(quarter, jnp.float32(4.0))
+    np.testing.assert_allclose(whole[0], np.linalg.matrix_power(np.asarray(quarter[0], float), 4), atol=1e-5)
+
+
+def test_covariances_are_carried_to_the_world():
+    """Against the poses that small motions about the pivot lead to."""
+    T = np.linalg.inv(looking(0.7))
+    pivot, rng = np.array([0.1, -0.05, 0.02]), np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) * 1e-4
+    columns = []
+    for tangent in root.T:
+        centre = jnp.asarray(T[:3, :3] @ pivot + T[:3, 3])
+        moved = np.linalg.inv(np.asarray(pose_filter.exp_about(jnp.asarray(tangent), centre), float) @ T)
+        at = np.linalg.inv(T)
+        turn = Rotation.from_matrix(moved[:3, :3] @ at[:3, :3].T).as_rotvec()
+        columns.append(np.concatenate([moved[:3, 3] - at[:3, 3], turn]))
+    expected = np.array(columns).T @ np.array(columns)
+    carried = camera_tracking._carried(T, pivot, root @ root.T)
+    np.testing.assert_allclose(carried, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_smooth_errors_move_a_pose_as_the_fields_covariance_says():
+    """Against (J J^T)^-1 J K J^T (J J^T)^-1 with the kernel K itself."""
+    rng = np.random.default_rng(1)
+    u, v = np.meshgrid(np.linspace(-0.1, 0.1, 12), np.linspace(-0.08, 0.08, 10))
+    points = np.stack([u, v, 0.6 + 0.3 * u**2], -1)
+    slope = np.stack([np.ones_like(u), u / 0.1, v / 0.08, *rng.normal(size=(3, *u.shape))])
+    seen = rng.uniform(size=u.shape) < 0.8
+    error = SmoothError(jnp.float32(0.001), jnp.float32(0.002), jnp.float32(0.05))
+    found = pose_covariance(
+        jnp.asarray(np.where(seen, slope, 0), jnp.float32), jnp.asarray(seen), jnp.asarray(points, jnp.float32), error
+    )
+    J, p = slope[:, seen], points[seen]
+    kernel = 0.001**2 + 0.002**2 * np.exp(-0.5 * ((p[:, None] - p) ** 2).sum(-1) / 0.05**2)
+    gain = np.linalg.solve(J @ J.T, J)
+    expected = np.sqrt(np.diag(gain @ kernel @ gain.T))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), expected, rtol=0.25)

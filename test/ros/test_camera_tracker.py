@@ -1,0 +1,95 @@
+"""camera_tracker as a process of its own: poses in the world's frame at the image's stamp, silence while it is lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from nav_msgs.msg import Path as PathMessage
+from std_srvs.srv import Trigger
+
+from bayes3d_ros.ros.conversions import stamp_to_ns
+
+TRACKER = "/camera_tracker: camera tracking"
+
+
+@pytest.fixture
+def rig(ros, library_folder, depth_frame):
+    """The node with a library, a camera, and what it publishes; `show(stamp, depth)` sends a flat image."""
+
+    class Rig:
+        def __init__(self):
+            self.camera, self.ros = ros.camera(), ros
+            self.poses = ros.listen(PoseWithCovarianceStamped, "/camera_tracker/camera_pose")
+            self.particles = ros.listen(PoseArray, "/camera_tracker/particles")
+            self.paths = ros.listen(PathMessage, "/camera_tracker/path")
+            self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+
+        def start(self, **parameters):
+            pairs = {"library": library_folder, "patience": 0.2, "most_particles": 3, "table_frame": "bench"}
+            words = [word for name, value in (pairs | parameters).items() for word in ("-p", f"{name}:={value}")]
+            here = __file__.replace("test_camera", "fake_camera")
+            ros.start(here, "--ros-args", *words)
+            self.camera.wait_for_subscriber()
+
+        def show(self, stamp, depth):
+            frame = depth_frame(stamp)
+            self.camera.publish(replace(frame, depth=np.full_like(frame.depth, depth)))
+
+    return Rig()
+
+
+def test_poses_particles_and_path(rig):
+    rig.start()
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "", TRACKER)
+    for k in range(1, 4):
+        rig.show(k * 10**9, 1.0 + 0.1 * k)
+        rig.ros.wait_for(lambda k=k: len(rig.poses) >= k and len(rig.paths) >= k, f"pose {k}")
+    pose = rig.poses[-1]
+    assert pose.header.frame_id == "bench" and stamp_to_ns(pose.header.stamp) == 3 * 10**9
+    assert pose.pose.pose.position.z == pytest.approx(1.3, abs=1e-3)
+    np.testing.assert_allclose(np.reshape(pose.pose.covariance, (6, 6)), np.diag(np.arange(1.0, 7.0)))
+    assert [p.position.x for p in rig.particles[-1].poses] == [0.0, 0.0, 1.0]  # of weights 0.6 and 0.4
+    assert rig.particles[-1].header == pose.header
+    path = rig.paths[-1]
+    assert [stamp_to_ns(p.header.stamp) for p in path.poses] == [10**9, 2 * 10**9, 3 * 10**9]
+    assert path.header.frame_id == "bench"
+    report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
+    values = {pair.key: pair.value for pair in report.status[0].values}
+    assert values["parsed"] == "3" and values["ess"] == "0.50" and values["state"] == "tracking"
+
+
+def test_a_lost_camera_has_no_pose_and_says_why(rig):
+    rig.start()
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose")
+    rig.show(2 * 10**9, 0.3)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "lost: only 10% of the objects' 100 pixels", TRACKER)
+    rig.show(3 * 10**9, np.nan)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "lost: the depth image has no return", TRACKER)
+    rig.show(4 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: len(rig.poses) == 2, "another pose")
+    assert stamp_to_ns(rig.poses[-1].header.stamp) == 4 * 10**9
+    rig.ros.wait_for(lambda: rig.paths and len(rig.paths[-1].poses) == 2, "a path without the lost frames")
+    assert rig.ros.call(Trigger, "/camera_tracker/reset", Trigger.Request()).success
+    rig.show(5 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: len(rig.poses) == 3, "a pose after the reset")
+    rig.ros.wait_for(lambda: rig.paths[-1].poses and len(rig.paths[-1].poses) == 1, "a path that begins anew")
+
+
+@pytest.mark.parametrize(
+    "parameters, said",
+    [
+        ({"library": "/nowhere"}, "/nowhere: no such library folder"),
+        ({"library": "''"}, "parameter library is not set"),
+        ({"window": 4}, "window must be odd, got 4"),
+        ({"hypotheses": 10}, "hypotheses"),
+    ],
+)
+def test_what_is_wrong_with_parameters_is_told(rig, parameters, said):
+    rig.start(**parameters)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, said, TRACKER)
+    rig.show(10**9, 1.0)
+    answer = rig.ros.call(Trigger, "/camera_tracker/reset", Trigger.Request())
+    assert not answer.success and said in answer.message and not rig.poses
