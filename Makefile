@@ -1,7 +1,7 @@
 # make setup   a virtual environment in .venv with everything in it (demo, test, lint and colcon do it first)
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
 # make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
-# make test    all tests;  make test PYTEST_ARGS="test/geometry -x"  some of them
+# make test    all tests, two files at a time;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
 # make clean   remove .venv and everything built
@@ -13,6 +13,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT := out/demo
 PYTEST_ARGS :=
+WORKERS := 2
 COLCON_TESTS :=
 # Set by the ROS wheels in their own processes; inherited by make, it would stop them from finding their libraries.
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -50,7 +51,7 @@ demo-learn: setup
 	$(BIN)/bayes3d parse bags/three_objects --library $(OUT)-learn/library --out $(OUT)-learn/parsed
 
 test: setup
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: setup
 	$(BIN)/ruff check .

