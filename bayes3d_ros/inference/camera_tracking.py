@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.camera import resize_depth, trustworthy, unproject
+from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.inference import pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
 from bayes3d_ros.inference.noise import for_returns, noise_grid
@@ -23,7 +23,7 @@ from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.posterior import ScenePosterior
 
 _NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
@@ -174,13 +174,7 @@ class CameraTracker:
         """The image at scoring resolution. What lies neither near the table nor near an object, as far as the expected
         pose tells, is none of the world's: not scored where there is a table, else beyond the objects."""
         settings = self.settings
-        width = min(settings.score_width, frame.intrinsics.width)
-        height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
-        camera = frame.intrinsics.subsampled(width, height)
-        depth = resize_depth(frame.depth, width, height)
-        with np.errstate(invalid="ignore"):
-            returned = np.isfinite(depth) & (depth >= settings.near) & (depth <= settings.far)
-        returned &= trustworthy(frame.depth, width, height)
+        camera, depth, _, returned = reduced(frame, settings.score_width, settings.near, settings.far)
         if not returned.any():
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
@@ -192,7 +186,7 @@ class CameraTracker:
             ray_y=jnp.asarray(rays[:, 0, 1]),
             focal=jnp.array([camera.fx, camera.fy], jnp.float32),
             centre=jnp.array([camera.cx, camera.cy], jnp.float32),
-            table=jnp.full((height, width), jnp.inf),
+            table=jnp.full(depth.shape, jnp.inf),
             outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
             front_margin=jnp.float32(3 * settings.sigma_max),
         )

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy, unproject
+from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
@@ -23,7 +23,7 @@ from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, Likelihood
 from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, Table
@@ -111,18 +111,12 @@ class SceneParser:
     def _observe(self, frame: DepthFrame) -> tuple[Image, Table, Float[np.ndarray, "4 4"], list[str]]:
         """The image at scoring resolution, and the table in it."""
         settings = self.settings
-        width = min(settings.score_width, frame.intrinsics.width)
-        height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
-        camera = frame.intrinsics.subsampled(width, height)
-        depth = resize_depth(frame.depth, width, height)
-        with np.errstate(invalid="ignore"):
-            returned = np.isfinite(depth) & (depth >= settings.near) & (depth <= settings.far)
-        if not returned.any():
+        camera, depth, in_range, returned = reduced(frame, settings.score_width, settings.near, settings.far)
+        if not in_range.any():
             raise ParseError(
                 f"the depth image has no return between {settings.near} and {settings.far} m "
                 f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
             )
-        returned &= trustworthy(frame.depth, width, height)
         points = unproject(np.where(returned, depth, np.nan), camera)
         T_camera_table, notes = self._find_table(frame, points[returned])
         kind = workspace(points, T_camera_table, self._table_size, settings.workspace_height)

@@ -1,11 +1,12 @@
 """One depth image, as the core sees it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy
 
 
 @dataclass(frozen=True)
@@ -28,3 +29,23 @@ class DepthFrame:
         expected = (self.intrinsics.height, self.intrinsics.width)
         if self.depth.shape != expected:
             raise ValueError(f"depth image is {self.depth.shape[::-1]}, intrinsics are for {expected[::-1]}")
+
+
+class Reduced(NamedTuple):
+    """A frame at the resolution that is scored."""
+
+    camera: Intrinsics
+    depth: Float[np.ndarray, "height width"]
+    returned: Bool[np.ndarray, "height width"]  # with a depth in range
+    trusted: Bool[np.ndarray, "height width"]  # and among returns that agree with it
+
+
+def reduced(frame: DepthFrame, width: int, near: float, far: float) -> Reduced:
+    """The frame `width` pixels across, no wider than it is; `near` and `far` in metres."""
+    width = min(width, frame.intrinsics.width)
+    height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
+    depth = resize_depth(frame.depth, width, height)
+    with np.errstate(invalid="ignore"):
+        returned = np.isfinite(depth) & (depth >= near) & (depth <= far)
+    trusted = returned & trustworthy(frame.depth, width, height)
+    return Reduced(frame.intrinsics.subsampled(width, height), depth, returned, trusted)
