@@ -26,6 +26,16 @@ def validate(settings: Any) -> None:
             raise ValueError(f"{f.name} must {expected} {meta['unit']}".rstrip() + f", got {value}")
 
 
+def _odd_window(window: int) -> None:
+    if window % 2 == 0:
+        raise ValueError(f"window must be odd, got {window}")
+
+
+def _near_before_far(near: float, far: float) -> None:
+    if near >= far:
+        raise ValueError(f"near ({near} m) must be smaller than far ({far} m)")
+
+
 @dataclass(frozen=True)
 class ParserSettings:
     """Settings of the scene parser. The model's own come first, the sampler's after them."""
@@ -83,12 +93,10 @@ class ParserSettings:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.window % 2 == 0:
-            raise ValueError(f"window must be odd, got {self.window}")
+        _odd_window(self.window)
         if self.fixed_objects > self.max_objects:
             raise ValueError(f"fixed_objects ({self.fixed_objects}) exceeds max_objects ({self.max_objects})")
-        if self.near >= self.far:
-            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")
+        _near_before_far(self.near, self.far)
 
 
 @dataclass(frozen=True)
@@ -116,8 +124,7 @@ class LearnerSettings:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.near >= self.far:
-            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")
+        _near_before_far(self.near, self.far)
 
 
 @dataclass(frozen=True)
@@ -163,7 +170,5 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.window % 2 == 0:
-            raise ValueError(f"window must be odd, got {self.window}")
-        if self.near >= self.far:
-            raise ValueError(f"near ({self.near} m) must be smaller than far ({self.far} m)")
+        _odd_window(self.window)
+        _near_before_far(self.near, self.far)
