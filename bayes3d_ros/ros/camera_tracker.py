@@ -26,11 +26,11 @@ from bayes3d_ros.inference.compilation import enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
-from bayes3d_ros.model.objects import LibraryError, load_library
+from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, why_no_input
+from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, one_line, why_no_input
 from bayes3d_ros.ros.parameters import CAMERA_TRACKER_SETTINGS, CameraTrackerNodeSettings, SettingsParameters
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
@@ -53,10 +53,9 @@ class _Session(NamedTuple):
     backend: str
 
 
-def make_follower(library: Path, settings: TrackerSettings) -> Follower:
-    """A tracker for the objects of a library. Raises LibraryError."""
-    models = load_library(library)
-    return CameraFollower(CameraTracker(models, settings), SceneParser(models))
+def make_follower(library: Library, settings: TrackerSettings) -> Follower:
+    """A tracker for the objects of a library, and a parser for its first frame."""
+    return CameraFollower(CameraTracker(library, settings), SceneParser(library))
 
 
 class CameraTrackerNode(Node):
@@ -102,12 +101,11 @@ class CameraTrackerNode(Node):
     def _begin(self) -> str:
         """Have the worker make a tracker from the parameters as they are now; what is wrong, or empty."""
         try:
-            library = self._settings.read(CameraTrackerNodeSettings).library
+            folder = self._settings.read(CameraTrackerNodeSettings).library
             settings = self._settings.read(TrackerSettings)
-            if not library:
+            if not folder:
                 raise ValueError("parameter library is not set: expected a folder of object models (bayes3d import)")
-            folder = Path(library).expanduser()
-            load_library(folder)  # what is wrong with it is the answer to who asks
+            library = load_library(Path(folder).expanduser())
         except (ValueError, LibraryError) as error:
             self._refusal = str(error)
             self.get_logger().error(f"{error}; correct it, then call ~/reset")
@@ -117,7 +115,7 @@ class CameraTrackerNode(Node):
         def job() -> None:
             self._known, self._session = None, None
             self._path.clear()
-            self._session = _Session(self._make(folder, settings), jax.default_backend())
+            self._session = _Session(self._make(library, settings), jax.default_backend())
             self.get_logger().info(f"the next frame shows the world; inference on {self._session.backend}")
 
         self._worker.call(job)
@@ -157,8 +155,7 @@ class CameraTrackerNode(Node):
         self._health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
 
     def _worker_failed(self, error: Exception) -> None:
-        told = " ".join(str(error).split())
-        self._problem(f"internal error, please report it: {type(error).__name__}: {told}")
+        self._problem(f"internal error, please report it: {one_line(error)}")
         self.get_logger().debug("".join(traceback.format_exception(error)))
 
     def _problem(self, text: str) -> None:

@@ -49,6 +49,11 @@ def why_no_input(inputs: Inputs) -> str:
     return ""
 
 
+def one_line(error: Exception) -> str:
+    """An exception's kind and text."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
 class Health:
     """Counts, times and the last problem of a node; used by its executor and its worker thread."""
 

@@ -22,7 +22,7 @@ from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, why_no_input
+from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, one_line, why_no_input
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     SCENE_PARSER_SETTINGS,
@@ -77,7 +77,7 @@ class SceneParserNode(Node):
             self._refuse(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            self._refuse(f"cannot compile the parser: {_one_line(error)}")
+            self._refuse(f"cannot compile the parser: {one_line(error)}")
             self.get_logger().debug(traceback.format_exc())
             return TransitionCallbackReturn.FAILURE
         self._refusal = ""
@@ -150,7 +150,7 @@ class SceneParserNode(Node):
                 if request == self._requests:
                     self._ready = prepared
             except Exception as error:
-                self._refusal = f"cannot compile the parser: {_one_line(error)}"
+                self._refusal = f"cannot compile the parser: {one_line(error)}"
                 self.get_logger().debug(traceback.format_exc())
             self._prepared.trigger()
 
@@ -248,7 +248,7 @@ class SceneParserNode(Node):
         self._health.output(posterior.seconds, posterior.ess, time.monotonic() - messages.arrived)
 
     def _worker_failed(self, error: Exception) -> None:
-        self._problem(f"internal error, please report it: {_one_line(error)}")
+        self._problem(f"internal error, please report it: {one_line(error)}")
         self.get_logger().debug("".join(traceback.format_exception(error)))
 
     def _problem(self, text: str) -> None:
@@ -288,10 +288,6 @@ class SceneParserNode(Node):
         if self._worker.idle:
             why = why_no_input(self._inputs.view()) or why
         return (WARN, why) if why else (OK, "parsing")
-
-
-def _one_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def main(args: list[str] | None = None) -> int:
