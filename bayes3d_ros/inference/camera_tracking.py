@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import unproject
+from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.inference import pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
 from bayes3d_ros.inference.noise import for_returns, noise_grid
@@ -24,6 +25,7 @@ from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
+from bayes3d_ros.model.pose_statistics import rotation_mean, second_moment
 from bayes3d_ros.model.posterior import ScenePosterior
 
 _NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
@@ -46,7 +48,6 @@ class Tracking:
     particles: pose_filter.State
     stamp_ns: int | None = None  # of the last frame
     frame_time: float = 0.0  # seconds between the last two frames
-    lost: str = ""  # why the last frame's pose is not to be trusted
 
 
 class CameraTracker:
@@ -74,7 +75,7 @@ class CameraTracker:
             raise TrackingError(f"expected objects of the library, it has no {', '.join(missing)}")
         kind = jnp.array([self.library.names.index(name) for name in world.types], jnp.int32)
         placed = jnp.asarray(world.T_world_object, jnp.float32)
-        pivot = jnp.asarray(self._centres(world).mean(0), jnp.float32)
+        pivot = jnp.asarray(self._spheres(world)[0].mean(0), jnp.float32)
         scene = pose_filter.Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
         return Tracking(world, scene, self._at_rest(T_world_camera))
 
@@ -112,7 +113,8 @@ class CameraTracker:
         T_camera_world, log_weight, info, smooth, explained, in_sight = jax.device_get(
             (particles.T_camera_world, particles.log_weight, info, smooth, explained, in_sight)
         )
-        T_world_camera, covariance = _moments(T_camera_world, log_weight)
+        poses = np.linalg.inv(T_camera_world.astype(np.float64))
+        T_world_camera, covariance = _moments(poses, log_weight)
         # A mean over few effective particles is itself off by what they were drawn from.
         sampled = info.proposed / (info.ess * len(log_weight))
         covariance += _carried(info.T_camera_world, np.asarray(known.scene.pivot), smooth + sampled)
@@ -121,7 +123,7 @@ class CameraTracker:
             frame_id=frame.frame_id,
             T_world_camera=T_world_camera,
             covariance=covariance,
-            particles=np.linalg.inv(T_camera_world.astype(np.float64)),
+            particles=poses,
             log_weight=log_weight,
             explained=float(explained),
             in_sight=int(in_sight),
@@ -131,9 +133,8 @@ class CameraTracker:
             sigma=float(info.sigma),
             seconds=time.perf_counter() - began,
         )
-        lost = self._why_lost(estimate)
-        estimate = replace(estimate, lost=lost)
-        return replace(known, particles=particles, stamp_ns=frame.stamp_ns, frame_time=seconds, lost=lost), estimate
+        now = replace(known, particles=particles, stamp_ns=frame.stamp_ns, frame_time=seconds)
+        return now, replace(estimate, lost=self._why_lost(estimate))
 
     def _why_lost(self, estimate: CameraEstimate) -> str:
         if estimate.in_sight < _OUT_OF_SIGHT:
@@ -151,24 +152,25 @@ class CameraTracker:
         if not suggested:
             seen = ", ".join(o.type for o in posterior.objects) or "no object"
             raise TrackingError(f"expected one of {', '.join(sorted(set(known.world.types)))} in sight, found {seen}")
+        image = self._image(frame, known.world, np.linalg.inv(suggested[0]))
         best, best_score = suggested[0], -np.inf
         for first in range(0, len(suggested), _CANDIDATES):
             some = suggested[first : first + _CANDIDATES]
             padded = np.linalg.inv(np.stack(some + some[:1] * (_CANDIDATES - len(some))))
-            image = self._image(frame, known.world, padded[0])
             scores = log_likelihood_of_cameras(
                 jnp.asarray(padded, jnp.float32), known.scene.world, image, self._arrays, _ROUGH, self.settings.window
             )
             value = np.asarray(scores)[: len(some), 0, 0]
             if value.max() > best_score:
                 best, best_score = some[int(value.argmax())], float(value.max())
-        return replace(known, particles=self._at_rest(best), stamp_ns=None, frame_time=0.0, lost="")
+        return replace(known, particles=self._at_rest(best), stamp_ns=None, frame_time=0.0)
 
-    def _centres(self, world: KnownWorld) -> Float[np.ndarray, "K 3"]:
-        """Middles of the objects' boxes, in the world."""
+    def _spheres(self, world: KnownWorld) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
+        """Middles, in the world, and radii of what encloses the objects' boxes."""
         models = [self.library.models[self.library.names.index(name)] for name in world.types]
         local = np.stack([m.T_object_box[:3, 3] for m in models])
-        return np.einsum("kab,kb->ka", world.T_world_object[:, :3, :3], local) + world.T_world_object[:, :3, 3]
+        centres = np.einsum("kab,kb->ka", world.T_world_object[:, :3, :3], local) + world.T_world_object[:, :3, 3]
+        return centres, np.array([0.5 * np.linalg.norm(m.box_size) for m in models])
 
     def _image(self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]) -> Image:
         """The image at scoring resolution. What lies neither near the table nor near an object, as far as the expected
@@ -196,11 +198,10 @@ class CameraTracker:
     ) -> np.ndarray:
         returned = np.isfinite(points[..., 2])
         near = np.zeros(returned.shape, bool)
-        for centre, name in zip(self._centres(world), world.types, strict=True):
+        for centre, radius in zip(*self._spheres(world), strict=True):
             middle = T_camera_world[:3, :3] @ centre + T_camera_world[:3, 3]
-            reach = 0.5 * np.linalg.norm(self.library.models[self.library.names.index(name)].box_size) + _NEAR_OBJECT
             with np.errstate(invalid="ignore"):
-                near |= ((points - middle) ** 2).sum(-1) < reach**2
+                near |= ((points - middle) ** 2).sum(-1) < (radius + _NEAR_OBJECT) ** 2
         if world.table:
             height = (points - T_camera_world[:3, 3]) @ T_camera_world[:3, 2]
             with np.errstate(invalid="ignore"):
@@ -237,7 +238,7 @@ class CameraFollower:
 def world_of(posterior: ScenePosterior, table: bool) -> tuple[KnownWorld, Float[np.ndarray, "4 4"]]:
     """The objects of a parsed scene at rest in the table's frame, and T_world_camera."""
     T_world_camera = np.linalg.inv(posterior.T_camera_table)
-    placed = np.array([T_world_camera @ _matrix(o.position, o.orientation) for o in posterior.objects])
+    placed = np.array([T_world_camera @ pose_matrix(o.position, o.orientation) for o in posterior.objects])
     return KnownWorld(tuple(o.type for o in posterior.objects), placed.reshape(-1, 4, 4), table), T_world_camera
 
 
@@ -248,13 +249,7 @@ def _suggested(world: KnownWorld, posterior: ScenePosterior) -> Iterator[Float[n
         for name, T_world_object in zip(world.types, world.T_world_object, strict=True):
             if name == found.type:
                 for position, orientation in poses:
-                    yield T_world_object @ np.linalg.inv(_matrix(position, orientation))
-
-
-def _matrix(position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(orientation).as_matrix(), position
-    return T
+                    yield T_world_object @ np.linalg.inv(pose_matrix(position, orientation))
 
 
 @jax.jit
@@ -292,18 +287,13 @@ def _smooth_covariance(
 
 
 def _moments(
-    T_camera_world: Float[np.ndarray, "N 4 4"], log_weight: Float[np.ndarray, "N"]
+    T_world_camera: Float[np.ndarray, "N 4 4"], log_weight: Float[np.ndarray, "N"]
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
-    """Mean T_world_camera and covariance, on the world's axes."""
-    T = np.linalg.inv(T_camera_world.astype(np.float64))
+    """Mean and covariance, on the world's axes."""
     weight = np.exp(log_weight.astype(np.float64))
-    weight /= weight.sum()
-    mean = np.eye(4)
-    turns = Rotation.from_matrix(T[:, :3, :3])
-    mean[:3, 3], middle = weight @ T[:, :3, 3], turns.mean(weight)
-    mean[:3, :3] = middle.as_matrix()
-    off = np.concatenate([T[:, :3, 3] - mean[:3, 3], (turns * middle.inv()).as_rotvec()], 1)
-    return mean, np.einsum("n,na,nb->ab", weight, off, off)
+    place, turn = T_world_camera[:, :3, 3], Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat()
+    middle, towards = weight @ place / weight.sum(), rotation_mean(turn, weight)
+    return pose_matrix(middle, towards), second_moment(place, turn, weight, middle, towards)
 
 
 def _carried(

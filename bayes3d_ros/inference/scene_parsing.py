@@ -11,6 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
+from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
@@ -292,11 +293,9 @@ class SceneParser:
         labels = np.zeros(depth.shape, np.uint16)
         for label, slot in enumerate(summary.slots, 1):
             kind = samples.type[summary.reference, slot]
-            T = np.eye(4, dtype=np.float32)
-            T[:3, :3] = Rotation.from_quat(samples.orientation[summary.reference, slot]).as_matrix()
-            T[:3, 3] = samples.position[summary.reference, slot]
+            T = pose_matrix(samples.position[summary.reference, slot], samples.orientation[summary.reference, slot])
             pair = (jnp.asarray(rays[..., 0]), jnp.asarray(rays[..., 1]))
-            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T), pair))
+            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T, jnp.float32), pair))
             nearer = drawn < depth
             depth, labels = np.where(nearer, drawn, depth), np.where(nearer, np.uint16(label), labels)
         return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels

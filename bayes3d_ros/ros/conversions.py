@@ -13,6 +13,7 @@ from std_msgs.msg import Header, String
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.model.camera_estimate import CameraEstimate
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ScenePosterior
@@ -70,9 +71,7 @@ def matrix_from_values(values: list[float]) -> Float[np.ndarray, "4 4"]:
     length = float(np.linalg.norm(numbers[3:]))
     if abs(length - 1) > 0.01:
         raise ValueError(f"pose orientation: expected a quaternion of length 1, got length {length:.3g}")
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
-    return T
+    return pose_matrix(numbers[:3], numbers[3:])
 
 
 def pose_message(position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Pose:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bayes3d_ros.bags import read_frames
@@ -20,6 +19,7 @@ from bayes3d_ros.evaluation.experiments.parsing_plot import plot
 from bayes3d_ros.evaluation.ground_truth import GROUND_TRUTH, GroundTruth, TrueObject
 from bayes3d_ros.evaluation.metrics import add_s, match_objects, rotation_error_degrees, translation_error
 from bayes3d_ros.geometry.mesh import load_mesh
+from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.model.objects import Library, load_library
 from bayes3d_ros.model.posterior import ObjectEstimate, ParseError, ScenePosterior
@@ -208,10 +208,7 @@ def _sureness(estimate: ObjectEstimate) -> Row:
 
 def estimated_pose(estimate: ObjectEstimate) -> Float[np.ndarray, "4 4"]:
     """T_camera_object."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(estimate.orientation).as_matrix()
-    pose[:3, 3] = estimate.position
-    return pose
+    return pose_matrix(estimate.position, estimate.orientation)
 
 
 def line(row: Row) -> str:
