@@ -19,10 +19,11 @@ from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.scene_parsing import SceneParser, frame_key
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_camera
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
+from bayes3d_ros.model.motions import exp_about, log_about, product
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.pose_statistics import rotation_mean, second_moment
@@ -256,7 +257,7 @@ def _suggested(world: KnownWorld, posterior: ScenePosterior) -> Iterator[Float[n
 def _slower(motion: Float[Array, "N 4 4"], ratio: Float[Array, ""]) -> Float[Array, "N 4 4"]:
     """What the same velocity does in `ratio` times the time."""
     zero = jnp.zeros(3)
-    return pose_filter.exp_about(ratio * pose_filter.log_about(motion, zero), zero)
+    return exp_about(ratio * log_about(motion, zero), zero)
 
 
 def _smooth_covariance(
@@ -267,7 +268,7 @@ def _smooth_covariance(
     pivot = (T_camera_world[:3, :3] * scene.pivot).sum(-1) + T_camera_world[:3, 3]
 
     def pose(tangent: Array) -> Array:
-        return product(pose_filter.exp_about(tangent, pivot), T_camera_world)
+        return product(exp_about(tangent, pivot), T_camera_world)
 
     depth, slope, seen = pose_filter.rendered_slopes(pose, jnp.zeros(6), image, scene)
     rays = jnp.broadcast_to(image.ray_x, depth.shape), jnp.broadcast_to(image.ray_y[:, None], depth.shape)

@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.resampling import effective_fraction, normalised
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_cameras
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.motions import exp_about, inverse, log_about, log_volume, product, rigid
 
 _FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
 _BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by round: before alignment, and after
@@ -89,38 +89,6 @@ def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_o
         jnp.float32(sigma),
         jnp.float32(p_outlier),
     )
-
-
-def exp_about(tangent: Float[Array, "*n 6"], centre: Float[Array, "3"]) -> Float[Array, "*n 4 4"]:
-    """The motion (shift, turn) about a centre."""
-    T = jaxlie.SE3.exp(tangent).as_matrix()
-    moved = T[..., :3, 3] + centre - (T[..., :3, :3] * centre).sum(-1)
-    return T.at[..., :3, 3].set(moved)
-
-
-def log_about(T: Float[Array, "*n 4 4"], centre: Float[Array, "3"]) -> Float[Array, "*n 6"]:
-    """The inverse of `exp_about`."""
-    moved = T[..., :3, 3] - centre + (T[..., :3, :3] * centre).sum(-1)
-    return jaxlie.SE3.from_matrix(T.at[..., :3, 3].set(moved)).log()
-
-
-def inverse(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
-    R = jnp.swapaxes(T[..., :3, :3], -1, -2)
-    back = -(R * T[..., None, :3, 3]).sum(-1)
-    return T.at[..., :3, :3].set(R).at[..., :3, 3].set(back)
-
-
-def rigid(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
-    """With a rotation that is one: rounding errors of products double from frame to frame."""
-    return jaxlie.SE3.from_matrix(T).normalize().as_matrix()
-
-
-def log_volume(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n"]:
-    """log of the invariant measure per Lebesgue measure of the tangent: 2 log(2 (1 - cos a) / a^2), a the angle."""
-    square = (tangent[..., 3:] ** 2).sum(-1)
-    safe = jnp.where(square < 1e-4, 1.0, square)
-    exact = jnp.log(2 * (1 - jnp.cos(jnp.sqrt(safe))) / safe)
-    return 2 * jnp.where(square < 1e-4, -square / 12, exact)
 
 
 def _log_t(square: Float[Array, "*n"]) -> Float[Array, "*n"]:

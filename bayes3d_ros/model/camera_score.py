@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
+from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.tiling import TILE, over_tiles, tiles_of_objects
 
@@ -20,11 +21,6 @@ class World(NamedTuple):
     type: Int[Array, "K"]
     T_world_object: Float[Array, "K 4 4"]
     table: Bool[Array, ""]  # whether the plane z = 0 is a surface
-
-
-def product(A: Float[Array, "*batch 4 4"], B: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
-    """Of matrices, written out: a multiplication may run at reduced precision on some backends."""
-    return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 
 
 def table_depth(

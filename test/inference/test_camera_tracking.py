@@ -19,6 +19,7 @@ from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import KnownWorld, TrackingError
 from bayes3d_ros.model.camera_score import World, render_camera
 from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.motions import exp_about
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ObjectEstimate
@@ -144,7 +145,7 @@ def test_what_cannot_be_tracked_is_refused_in_a_line(tracker, world, frame):
 
 
 def test_a_motion_is_scaled_with_the_time_between_frames():
-    quarter = pose_filter.exp_about(jnp.array([[0.1, -0.05, 0.02, 0.2, 0.1, -0.3]]), jnp.zeros(3))
+    quarter = exp_about(jnp.array([[0.1, -0.05, 0.02, 0.2, 0.1, -0.3]]), jnp.zeros(3))
     whole = camera_tracking._slower(quarter, jnp.float32(4.0))
     np.testing.assert_allclose(whole[0], np.linalg.matrix_power(np.asarray(quarter[0], float), 4), atol=1e-5)
 
@@ -157,7 +158,7 @@ def test_covariances_are_carried_to_the_world():
     columns = []
     for tangent in root.T:
         centre = jnp.asarray(T[:3, :3] @ pivot + T[:3, 3])
-        moved = np.linalg.inv(np.asarray(pose_filter.exp_about(jnp.asarray(tangent), centre), float) @ T)
+        moved = np.linalg.inv(np.asarray(exp_about(jnp.asarray(tangent), centre), float) @ T)
         at = np.linalg.inv(T)
         turn = Rotation.from_matrix(moved[:3, :3] @ at[:3, :3].T).as_rotvec()
         columns.append(np.concatenate([moved[:3, 3] - at[:3, 3], turn]))

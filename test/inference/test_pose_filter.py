@@ -11,7 +11,8 @@ from scipy.stats import multivariate_t
 from bayes3d_ros.evaluation.agreement import ratio_and_error
 from bayes3d_ros.inference import pose_filter as tracking
 from bayes3d_ros.inference.noise import for_returns, log_marginal, noise_grid
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, product, render_camera
+from bayes3d_ros.model import motions
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE
@@ -75,10 +76,10 @@ def test_motions_about_a_centre():
     """A turn about a centre leaves it where it is; logarithm and inverse undo."""
     centre = jnp.array([0.1, -0.2, 0.6])
     tangent = tangents(50, [0.1, 0.1, 0.1, 0.6, 0.6, 0.6])
-    T = tracking.exp_about(tangent, centre)
-    np.testing.assert_allclose(tracking.log_about(T, centre), tangent, atol=2e-6)
-    np.testing.assert_allclose(product(T, tracking.inverse(T)), np.broadcast_to(np.eye(4), T.shape), atol=1e-6)
-    turn = tracking.exp_about(tangent.at[:, :3].set(0.0), centre)
+    T = motions.exp_about(tangent, centre)
+    np.testing.assert_allclose(motions.log_about(T, centre), tangent, atol=2e-6)
+    np.testing.assert_allclose(motions.product(T, motions.inverse(T)), np.broadcast_to(np.eye(4), T.shape), atol=1e-6)
+    turn = motions.exp_about(tangent.at[:, :3].set(0.0), centre)
     moved = (np.asarray(turn)[:, :3, :3] @ np.asarray(centre)) + np.asarray(turn)[:, :3, 3]
     np.testing.assert_allclose(moved, np.broadcast_to(centre, moved.shape), atol=1e-6)
 
@@ -89,11 +90,11 @@ def test_volume_is_that_of_the_invariant_measure():
     zero = jnp.zeros(3)
 
     def composed(tangent):
-        return tracking.log_about(product(tracking.exp_about(tangent, zero), tracking.exp_about(by, zero)), zero)
+        return motions.log_about(motions.product(motions.exp_about(tangent, zero), motions.exp_about(by, zero)), zero)
 
     jacobian = np.asarray(jax.vmap(jax.jacfwd(composed))(at), float)
     found = np.log(np.abs(np.linalg.det(jacobian)))
-    expected = np.asarray(tracking.log_volume(at) - tracking.log_volume(jax.vmap(composed)(at)))
+    expected = np.asarray(motions.log_volume(at) - motions.log_volume(jax.vmap(composed)(at)))
     np.testing.assert_allclose(found, expected, atol=2e-4)
 
 
@@ -105,8 +106,8 @@ def test_the_predictive_is_a_density():
     tangent = rng.normal(size=(20000, 6)) * np.sqrt(3 / rng.chisquare(3, (20000, 1))) * scale
     log_q = multivariate_t(shape=np.diag(scale**2), df=3).logpdf(tangent)
     tangent = jnp.asarray(tangent, jnp.float32)
-    log_q -= np.asarray(tracking.log_volume(tangent))
-    T = product(tracking.exp_about(tangent, jnp.zeros(3)), expected)
+    log_q -= np.asarray(motions.log_volume(tangent))
+    T = motions.product(motions.exp_about(tangent, jnp.zeros(3)), expected)
     log_p = np.asarray(tracking.log_predictive(T, expected, jnp.zeros(1), motion))[:, 0]
     mean, error = ratio_and_error(log_p - log_q, 0.0)
     assert error < 0.02 and abs(mean - 1) < 4 * error
@@ -118,12 +119,12 @@ def test_evidence_is_that_of_plain_monte_carlo(scene):
     image = image_from(truth, scene, 0.03, np.random.default_rng(0))
     grid = for_returns(grid, image.kind)
     motion = tracking.Motion(jnp.float32(0.006), jnp.float32(0.02))
-    before = np.asarray(tracking.exp_about(jnp.array([0.004, -0.003, 0.004, 0.01, -0.01, 0.01]), jnp.zeros(3))) @ truth
+    before = np.asarray(motions.exp_about(jnp.array([0.004, -0.003, 0.004, 0.01, -0.01, 0.01]), jnp.zeros(3))) @ truth
     _, own = tracking.shares(HYPOTHESES)
     state = tracking.start(before, own, 0.03)
     rng = jax.random.key(7)
     tangent = tracking._draw_t(rng, 40000) * jnp.array([0.006] * 3 + [0.02] * 3)
-    drawn = product(tracking.exp_about(tangent, jnp.zeros(3)), jnp.asarray(before, jnp.float32))
+    drawn = motions.product(motions.exp_about(tangent, jnp.zeros(3)), jnp.asarray(before, jnp.float32))
     parts = [
         log_marginal(log_likelihood_of_cameras(part, scene.world, image, scene.library, grid.coarse, WINDOW), grid)
         for part in jnp.split(drawn, 20)
@@ -157,8 +158,8 @@ def test_a_camera_is_followed_and_its_covariance_holds(scene):
             jax.random.key(k), state, image, scene, for_returns(grid, image.kind), motion, HYPOTHESES, WINDOW
         )
         compiled = compiled or tracking.step._cache_size()
-        change = product(jnp.asarray(truth, jnp.float32), tracking.inverse(info.T_camera_world))
-        off = tracking.log_about(change, jnp.asarray(truth[:3, 3], jnp.float32))
+        change = motions.product(jnp.asarray(truth, jnp.float32), motions.inverse(info.T_camera_world))
+        off = motions.log_about(change, jnp.asarray(truth[:3, 3], jnp.float32))
         distances.append(float(off @ jnp.linalg.solve(info.covariance + 1e-12 * jnp.eye(6), off)))
         assert float(jnp.abs(off[:3]).max()) < 0.002 and float(jnp.abs(off[3:]).max()) < 0.03
     assert tracking.step._cache_size() == compiled
