@@ -19,6 +19,7 @@ from bayes3d_ros.inference.mode_search import (
     adapt,
     as_mixture,
     best_first,
+    factor,
     narrow,
     sharpen,
     take,
@@ -141,7 +142,7 @@ def candidates(
     contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
     contact, information = align(contact, evidence, image, library, table)
     loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
-    found = Hypotheses(contact, jnp.linalg.inv(information / _ALIGNED**2 + loose))
+    found = Hypotheses(contact, factor(jnp.linalg.inv(information / _ALIGNED**2 + loose)))
     score = sketch_score(contact, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(contact, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)

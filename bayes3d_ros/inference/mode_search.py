@@ -23,14 +23,14 @@ _INFLATION, _FLATTEN = 1.5, 4.0
 _TRUST, _TRUST_TYPES = 0.5, 0.3
 _EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find
 _PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
-_SMALLEST_SPREAD = (2e-5, 2e-5, 2e-4)  # metres, metres, radians
+_SMALLEST_SPREAD, _LARGEST_SPREAD = (2e-5, 2e-5, 2e-4), (0.05, 0.05, 2.0)  # metres, metres, radians
 
 
 class Hypotheses(NamedTuple):
     """Objects, with how far off in (x, y, yaw) each may be."""
 
     contact: Contact  # [N]
-    covariance: Float[Array, "N 3 3"]
+    scale: Float[Array, "N 3 3"]  # lower Cholesky factor of the covariance
 
 
 class Pilots(NamedTuple):
@@ -48,6 +48,21 @@ def take(tree: Tree, index: Array | slice) -> Tree:
 def best_first(tree: Tree, score: Float[Array, "N"], count: int) -> tuple[Tree, Float[Array, "count"]]:
     best, index = jax.lax.top_k(score, count)
     return take(tree, index), best
+
+
+def factor(covariance: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
+    """Lower Cholesky factors of covariances in (x, y, yaw) that float32 may have made slightly indefinite."""
+    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), jnp.array(_SMALLEST_SPREAD) ** 2))
+    correlation = covariance / (spread[:, :, None] * spread[:, None, :])
+    return spread[:, :, None] * jnp.linalg.cholesky(correlation + 1e-5 * jnp.eye(3))
+
+
+def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
+    """Scales of a size that a mode may have: one that followed a ridge without end must not grow without end."""
+    smallest = jnp.eye(3) * jnp.array(_SMALLEST_SPREAD)
+    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, smallest), scale)
+    excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(_LARGEST_SPREAD)).max(1)
+    return scale / jnp.maximum(excess, 1)[:, None, None]
 
 
 def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M D"]:
@@ -89,8 +104,7 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
     and theirs."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
-        contact, covariance = state
-        scale = jnp.linalg.cholesky(covariance)
+        contact, scale = state
         offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
         value = gains(jax.tree.map(jnp.ravel, _draw_about(contact, offset))).reshape(offset.shape[:2])
@@ -100,7 +114,8 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
-        return Hypotheses(_move(contact, best), 1.2 * learned + 0.05 * covariance + floor), value.max(1)
+        covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
+        return Hypotheses(_move(contact, best), factor(covariance)), value.max(1)
 
     modes, values = jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))
     return modes, values[-1]
@@ -113,8 +128,7 @@ def sharpen(
     mode's covariance. Returns the modes and the best log likelihood met."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
-        contact, covariance = state
-        scale = jnp.linalg.cholesky(covariance)
+        contact, scale = state
         step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
         about = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
         value = gains(jax.tree.map(jnp.ravel, about)).reshape(step.shape[:2])
@@ -140,10 +154,8 @@ def sharpen(
         off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
         top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
         inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
-        covariance = jnp.einsum("mab,mbc,mdc->mad", scale, inverse, scale)
-        covariance += jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
         moved = _move(contact, jnp.einsum("mab,mb->ma", scale, top))
-        return Hypotheses(moved, covariance), value.max(1)
+        return Hypotheses(moved, _bounded(scale @ jnp.linalg.cholesky(inverse))), value.max(1)
 
     modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
     return modes, values[-1]
@@ -208,21 +220,17 @@ def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Mo
     # A turn of one carries the middle of the other around.
     zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
     rows = [jnp.stack(row, -1) for row in ((one, zero, -dy), (zero, one, dx), (zero, zero, one))]
-    carried = jnp.einsum("maij,mjk->maik", jnp.stack(rows, -2), scale)
-    unit = jnp.array(_SMALLEST_SPREAD)
-    carried = carried / unit[:, None]  # metres and radians alike: float32 has no room for both in a square
-    square = jnp.einsum("maij,makj->maik", carried, carried)
-    factor = unit[:, None] * jnp.linalg.cholesky(square + 1e-3 * jnp.eye(3))
+    carried = jnp.einsum("maij,mjk->maik", jnp.stack(rows, -2), scale).reshape(-1, 3, 3)
     value = jnp.maximum(gains(jax.tree.map(jnp.ravel, centre)), -1e9).reshape(face.shape)
     share = jnp.logaddexp(jax.nn.log_softmax(value / 2, 1), jnp.log(0.03 / face.shape[1]))
     weight = jax.nn.log_softmax((modes.log_weight[:, None] + share).ravel())
-    return Modes(jax.tree.map(jnp.ravel, centre), factor.reshape(-1, 3, 3), weight)
+    return Modes(jax.tree.map(jnp.ravel, centre), factor(carried @ carried.swapaxes(1, 2)), weight)
 
 
 def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
     """A mixture of the modes, weighted by their log likelihoods and volumes. Flattened: the values are rough, and a
     mode that is missed costs more than one that is tried in vain."""
-    scale = jnp.linalg.cholesky(_INFLATION * modes.covariance)
+    scale = _INFLATION**0.5 * modes.scale
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
     return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))

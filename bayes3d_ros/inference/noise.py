@@ -55,7 +55,7 @@ class NoiseGrid(NamedTuple):
     to_fine_p: Float[Array, "Pf P"]
     log_mass: Float[Array, "Sf Pf"]  # prior mass of the fine points
     p_error: Float[Array, "Pf"]  # by which splines miss log(1 - p_outlier)
-    returns: Float[Array, ""]  # how many returns a table sums over
+    returns: Float[Array, ""]  # how many returns a table sums over, times their weight
     sigma_error: Float[Array, "Sf P"]  # by which splines in sigma fall short of the log likelihood of a reference scene
     sigma_error_parts: Float[Array, "K P"]  # the same at the parts of the fine steps
 
@@ -87,9 +87,12 @@ def noise_grid(sigma_max: float) -> NoiseGrid:
     )
 
 
-def for_returns(grid: NoiseGrid, kind: Int[Array, "*shape"]) -> NoiseGrid:
-    """The grid for tables of an image with these kinds of pixels. Those beyond the workspace hardly depend on p."""
-    return grid._replace(returns=(jnp.asarray(kind) == IN_WORKSPACE).sum().astype(jnp.float32))
+def for_returns(
+    grid: NoiseGrid, kind: Int[Array, "*shape"], weight: Float[Array, ""] | np.float32 = np.float32(1)
+) -> NoiseGrid:
+    """The grid for tables of an image with these kinds of pixels, each of this weight. Those beyond the workspace
+    hardly depend on p."""
+    return grid._replace(returns=weight * (jnp.asarray(kind) == IN_WORKSPACE).sum().astype(jnp.float32))
 
 
 @partial(jax.jit, static_argnames="window")
@@ -107,7 +110,7 @@ def for_image(grid: NoiseGrid, image: Image, window: int) -> NoiseGrid:
     table = table - table.max()
     exact = jax.lax.Precision.HIGHEST
     error = table - jnp.einsum("rs,sp->rp", jnp.asarray(_TO_DENSE), table[::_DENSE], precision=exact)
-    return for_returns(grid, image.kind)._replace(
+    return for_returns(grid, image.kind, image.weight)._replace(
         sigma_error=jnp.einsum("fr,rp->fp", jnp.asarray(_DENSE_TO_FINE), error, precision=exact),
         sigma_error_parts=jnp.einsum("kr,rp->kp", jnp.asarray(_DENSE_TO_PARTS), error, precision=exact),
     )

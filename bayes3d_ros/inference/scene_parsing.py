@@ -138,6 +138,7 @@ class SceneParser:
             outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
             front_margin=jnp.float32(3 * settings.sigma_max),
             likelihood=Likelihood(settings.likelihood),
+            weight=jnp.float32(settings.pixel_weight),
         )
         table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
         return image, table, T_camera_table, notes

@@ -63,6 +63,12 @@ class ParserSettings:
         "what a return is scored as: the depth of its pixel, or the paper's free 3D point (too sure of the noise)",
         choices=("depth", "points"),
     )
+    pixel_weight: float = setting(
+        0.1,
+        "share of every pixel's log likelihood that counts: neighbouring pixels err together; 1 if they do not",
+        low=0.001,
+        high=1.0,
+    )
     window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
     sigma_max: float = setting(
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1

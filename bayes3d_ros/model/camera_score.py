@@ -58,7 +58,7 @@ def log_likelihood_of_cameras(
         pixels = observed(image, u, v, (TILE, TILE))
         value = log_likelihood(depth, pixels, noise, window)
         alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
-        return total.at[n].add(jnp.where(real, value - alone, 0.0).transpose(2, 0, 1))
+        return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
     return over_tiles(score, start, tiles, count, draw, image, half)

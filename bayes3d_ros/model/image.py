@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.model.likelihood import NO_RETURN, Likelihood, Pixels
@@ -30,6 +31,7 @@ class Image(NamedTuple):
     outlier_scale: Float[Array, ""]
     front_margin: Float[Array, ""]
     likelihood: Likelihood = Likelihood()
+    weight: Float[Array, ""] | np.float32 = np.float32(1)  # share of every pixel's log likelihood that counts
     points: FreePoints | None = None  # scored in place of the depth image, of which the search still makes use
 
 
@@ -63,6 +65,7 @@ def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
         outlier_scale=image.outlier_scale,
         front_margin=image.front_margin,
         likelihood=image.likelihood,
+        weight=image.weight,
     )
     return pixels if image.points is None else _observed_points(image.points, pixels, rows, columns, inside)
 

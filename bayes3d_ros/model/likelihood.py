@@ -37,6 +37,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 NO_RETURN, IN_WORKSPACE, BEYOND = 0, 1, 2  # kinds of pixels
@@ -74,6 +75,7 @@ class Pixels(NamedTuple):
     likelihood: Likelihood = Likelihood()
     # Of free points: x / z and y / z less those of the pixel's ray. A depth image has its points on the rays.
     beside: tuple[Float[Array, "h w T"], Float[Array, "h w T"]] | None = None
+    weight: Float[Array, ""] | np.float32 = np.float32(1)  # share of every pixel's log likelihood that counts
 
 
 def inlier_density(
@@ -147,9 +149,10 @@ likelihoods: dict[str, Callable] = {"depth": inlier_density, "points": point_den
 def log_likelihood(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
 ) -> Float[Array, "S P T"]:
-    """Sum over the pixels of each tile of the log likelihood, for every pair of noise values. Their number is a
-    multiple of four; `rendered` has a border of window // 2 pixels around. Of free points a pixel may hold several:
-    then `pixels` has L times the tiles of `rendered`, all tiles of one layer after those of the other."""
+    """Sum over the pixels of each tile of the log likelihood, times their weight, for every pair of noise values.
+    Their number is a multiple of four; `rendered` has a border of window // 2 pixels around. Of free points a pixel
+    may hold several: then `pixels` has L times the tiles of `rendered`, all tiles of one layer after those of the
+    other."""
     layers = pixels.depth.shape[-1] // rendered.shape[-1]
     rendered = jnp.concatenate([rendered] * layers, -1) if layers > 1 else rendered
     half = window // 2
@@ -164,7 +167,7 @@ def log_likelihood(
     tiles = outlier.shape[-1]
     at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
-    total = _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
+    total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
     return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
 
 

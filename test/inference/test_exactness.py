@@ -20,8 +20,9 @@ from bayes3d_ros.evaluation.exact_pairs import close_to, true_places
 from bayes3d_ros.evaluation.exact_reference import enumerate_object, marginals, yaw_cells
 from bayes3d_ros.evaluation.experiments import exactness
 from bayes3d_ros.evaluation.experiments.exactness import binned, problem_summary, run, run_marginals
-from bayes3d_ros.evaluation.small_problems import PROBLEMS
+from bayes3d_ros.evaluation.small_problems import PROBLEMS, SIGMA_MAX, WINDOW
 from bayes3d_ros.inference import coarse_to_fine, smc
+from bayes3d_ros.inference.noise import for_image, noise_grid
 from bayes3d_ros.model import likelihood
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, NO_RETURN, Noise, Pixels
 from bayes3d_ros.model.scene_graph import Contact
@@ -133,6 +134,20 @@ def test_a_handle_in_sight(seen, seen_exact, seen_sampled, step):
     turn = (result.weight * np.exp(1j * result.contact.yaw[:, 0])).sum()
     assert np.degrees(np.sqrt(-2 * np.log(np.abs(turn)))) < 5
     assert np.degrees(np.abs(np.angle(turn * np.exp(-1j * float(seen.truth.yaw[0]))))) < 10
+
+
+def test_pixels_that_count_in_part(seen, step):
+    """The posterior of a weighted likelihood is enumerated like any other; it is wider."""
+    context = seen.context._replace(image=seen.context.image._replace(weight=np.float32(0.4)))
+    grid = for_image(noise_grid(SIGMA_MAX), context.image, WINDOW)
+    part = seen._replace(context=context, grid=grid)
+    log_z, mixed = sampled(part, step())
+    log_truth, truth = enumerated(part)
+    assert agrees(log_z, log_truth)
+    assert total_variation(binned("yaw", mixed["yaw"]), binned("yaw", truth.yaw)) < 0.1
+    for name in ("x", "y", "yaw"):
+        width, mass = region_against(mixed[name], getattr(truth, name), 0.9)
+        assert 0.8 < width < 1.2 and 0.8 < mass < 0.97
 
 
 def test_a_hidden_handle(hidden, hidden_exact, step):

@@ -18,7 +18,13 @@ from bayes3d_ros.model.rendering import reference
 
 CAMERA = Intrinsics(90.0, 90.0, 47.5, 35.5, 96, 72)
 SETTINGS = ParserSettings(
-    score_width=96, particles=48, max_objects=3, sigma_max=0.006, table_width=0.6, table_depth=0.6
+    score_width=96,
+    pixel_weight=1.0,
+    particles=48,
+    max_objects=3,
+    sigma_max=0.006,
+    table_width=0.6,
+    table_depth=0.6,
 )
 SIGMA = 0.002
 

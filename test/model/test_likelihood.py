@@ -205,6 +205,13 @@ def test_sums_the_logs_of_pixels(tiles):
     np.testing.assert_allclose(got, expected, rtol=2e-6, atol=2e-3)
 
 
+def test_a_weight_is_a_share_of_every_log_likelihood(tiles):
+    rendered, pixels = tiles
+    whole, part = (score(rendered, pixels._replace(weight=np.float32(w)), NOISE, 3) for w in (1.0, 0.3))
+    np.testing.assert_array_equal(whole, score(rendered, pixels, NOISE, 3))
+    np.testing.assert_allclose(part, 0.3 * np.asarray(whole), rtol=1e-6)
+
+
 def test_tiles_do_not_see_each_other(tiles):
     rendered, pixels = tiles
     order = np.random.default_rng(0).permutation(rendered.shape[-1])

@@ -26,7 +26,9 @@ __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
     (
         "independent pixels",
-        ParserSettings(depth_bias=0.0, depth_waviness=0.0, table_height_sigma=0.0, table_tilt_sigma=0.0),
+        ParserSettings(
+            pixel_weight=1.0, depth_bias=0.0, depth_waviness=0.0, table_height_sigma=0.0, table_tilt_sigma=0.0
+        ),
     ),
     ("offset an object", ParserSettings(depth_waviness=0.0)),
     ("smooth field", ParserSettings()),
