@@ -36,6 +36,7 @@ _EXPLAINED = (0.006, 0.01)  # metres, and share of the depth, within which a ret
 _STEEP = 5.0  # slope of depth against a shift, from which it is an outline's and no surface's
 _OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.py`)
 _ARM = 0.03  # metres, that they hold a turn by at least
+_FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
 _CANDIDATES = 64  # poses that a parsed scene may suggest
 _ROUGH = Noise(jnp.array([0.006]), jnp.array([0.1]))  # at which those are compared
 
@@ -60,7 +61,7 @@ class CameraTracker:
     def __init__(self, library: Library, settings: TrackerSettings = TrackerSettings()) -> None:
         self.library, self.settings = library, settings
         self._arrays = library_arrays(library)
-        self._grid = noise_grid(settings.sigma_max)
+        self._grid = noise_grid(settings.sigma_max, _FINE)
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._smooth = jax.jit(_smooth_covariance)

@@ -60,17 +60,18 @@ class NoiseGrid(NamedTuple):
     sigma_error_parts: Float[Array, "K P"]  # the same at the parts of the fine steps
 
 
-def noise_grid(sigma_max: float) -> NoiseGrid:
+def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE)) -> NoiseGrid:
     """sigma ~ U(0, sigma_max) and p_outlier ~ U(0, 1), both proper; the mass below the grid's ends is left out.
 
     Each return's log(p a + (1 - p) b) is log(a e^v + b) + log(1 - p), v = logit p: the first term is nearly straight in
     v where a return is clearly the one or the other, the second bends and is known. So what splines make of it is taken
-    out again, times the number of returns (`for_returns`); none as it comes from here.
+    out again, times the number of returns (`for_returns`); none as it comes from here. `fine`: points of sigma and of
+    p_outlier between coarse ones; `for_image` and `sample` expect the default.
     """
     u = np.log(sigma_max) - np.log(2) / 3 * np.arange(_SIGMA_STEPS)[::-1]
     v = np.linspace(_logit(_P_LOW), _logit(_P_HIGH), _P_STEPS)
-    u_fine = np.linspace(u[0], u[-1], (len(u) - 1) * _SIGMA_FINE + 1)
-    v_fine = np.linspace(v[0], v[-1], (len(v) - 1) * _P_FINE + 1)
+    u_fine = np.linspace(u[0], u[-1], (len(u) - 1) * fine[0] + 1)
+    v_fine = np.linspace(v[0], v[-1], (len(v) - 1) * fine[1] + 1)
     p_fine = 1 / (1 + np.exp(-v_fine))
     mass_sigma = np.exp(u_fine) / sigma_max * _trapezoid(u_fine)
     mass_p = p_fine * (1 - p_fine) * _trapezoid(v_fine)
@@ -88,7 +89,7 @@ def noise_grid(sigma_max: float) -> NoiseGrid:
 
 
 def for_returns(
-    grid: NoiseGrid, kind: Int[Array, "*shape"], weight: Float[Array, ""] | np.float32 = np.float32(1)
+    grid: NoiseGrid, kind: Int[Array, "*shape"], weight: Float[Array, ""] | np.floating | float = 1.0
 ) -> NoiseGrid:
     """The grid for tables of an image with these kinds of pixels, each of this weight. Those beyond the workspace
     hardly depend on p."""
@@ -129,14 +130,15 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
 def near_peak(table: Float[Array, "S P"], grid: NoiseGrid) -> NoiseGrid:
     """The part of the grid about the best sigma of this table: at half the cost, close enough for a search."""
     first = jnp.clip(jnp.argmax(table.max(1)) - _NEAR // 2, 0, _SIGMA_STEPS - _NEAR)
-    rows = (_NEAR - 1) * _SIGMA_FINE + 1
+    fine = (len(grid.fine.sigma) - 1) // (_SIGMA_STEPS - 1)
+    rows = (_NEAR - 1) * fine + 1
     part = jax.lax.dynamic_slice_in_dim
     return NoiseGrid(
         coarse=grid.coarse._replace(sigma=part(grid.coarse.sigma, first, _NEAR)),
-        fine=grid.fine._replace(sigma=part(grid.fine.sigma, first * _SIGMA_FINE, rows)),
-        to_fine_sigma=jnp.float32(CubicSpline(np.arange(_NEAR), np.eye(_NEAR))(np.arange(rows) / _SIGMA_FINE)),
+        fine=grid.fine._replace(sigma=part(grid.fine.sigma, first * fine, rows)),
+        to_fine_sigma=jnp.float32(CubicSpline(np.arange(_NEAR), np.eye(_NEAR))(np.arange(rows) / fine)),
         to_fine_p=grid.to_fine_p,
-        log_mass=part(grid.log_mass, first * _SIGMA_FINE, rows),
+        log_mass=part(grid.log_mass, first * fine, rows),
         p_error=grid.p_error,
         returns=grid.returns,
         sigma_error=jnp.zeros((rows, grid.sigma_error.shape[1])),  # the spline of a part is another

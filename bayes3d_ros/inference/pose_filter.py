@@ -6,8 +6,10 @@ frame the likelihood is searched coarse to fine for a mixture q; draws from it h
 
     p(image | T) sum_j w_j p(T | particle j) / q(T),
 
-the predictive of the whole population, not of one ancestor (the marginal particle filter, Klaas et al. 2005), so that
-the search may go where the image says and the weights stay proper. Densities are over SE(3)'s invariant measure.
+the predictive of a whole population, not of one ancestor (the marginal particle filter, Klaas et al. 2005), so that
+the search may go where the image says and the weights stay proper. The population is one of `_ANCESTORS` resampled
+particles: the sum is over every pair, and half a million of them would cost more than the images. Densities are over
+SE(3)'s invariant measure.
 """
 
 from collections.abc import Callable
@@ -21,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference.noise import NoiseGrid
-from bayes3d_ros.inference.resampling import effective_fraction, normalised
+from bayes3d_ros.inference.resampling import effective_fraction, normalised, systematic
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
@@ -38,6 +40,7 @@ _DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
 _RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
 _KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
 _WIDEN = 1.2  # of the scale learned from a round, for the next
+_ANCESTORS = 64  # of the particles, that draws may have moved from
 _FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
 _SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
 
@@ -178,27 +181,32 @@ def step(
     _, own = shares(hypotheses)
     if len(state.log_weight) != own:
         raise ValueError(f"expected {own} particles of {hypotheses} hypotheses, got {len(state.log_weight)}")
-    expected = product(state.motion, state.T_camera_world)
-    search_key, draw_key, ancestor_key = jax.random.split(key, 3)
+    search_key, draw_key, ancestor_key, kept_key = jax.random.split(key, 4)
+    kept = systematic(kept_key, state.log_weight, min(_ANCESTORS, own))
+    before, motions = state.T_camera_world[kept], state.motion[kept]
+    log_share = jnp.full(len(kept), -jnp.log(len(kept)))
+    expected = product(motions, before)
 
     def score(T: Float[Array, "D 4 4"], noise: Noise) -> Float[Array, "D S P"]:
         return log_likelihood_of_cameras(T, scene.world, image, scene.library, noise, window)
 
     chart = _search(search_key, state, expected, image, scene, motion, hypotheses, score)
-    T = _propose(draw_key, chart, expected, state.log_weight, motion, own)
-    by_ancestor = log_predictive(T, expected, state.log_weight, motion)
+    T = _propose(draw_key, chart, expected, motion, own)
+    by_ancestor = log_predictive(T, expected, log_share, motion)
     log_prior = jax.nn.logsumexp(by_ancestor, 1)
     log_q = jnp.logaddexp(
         jnp.log1p(-_FROM_MOTION) + chart.log_density(T),
         jnp.log(_FROM_MOTION) + log_prior,
     )
-    table = score(T, grid.coarse)
-    log_likelihood = noise_model.log_marginal(table, grid)
+    # Noise about the best for the pose that the search ended at: no draw has a say in it, and the rest has no mass.
+    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid)
+    table = score(T, near.coarse)
+    log_likelihood = noise_model.log_marginal(table, near)
     log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
     ancestor = jax.random.categorical(ancestor_key, by_ancestor)
     T = rigid(T)
-    moved = rigid(product(T, inverse(state.T_camera_world[ancestor])))
-    noise = noise_model.peak(table[jnp.argmax(log_weight)], grid)
+    moved = rigid(product(T, inverse(before[ancestor])))
+    noise = noise_model.peak(table[jnp.argmax(log_weight)], near)
     new = State(T, moved, log_weight, noise.sigma[0], noise.p_outlier[0])
     mean, covariance = _moments(chart, T, log_weight)
     return new, Info(
@@ -226,7 +234,7 @@ def shares(hypotheses: int) -> tuple[int, int]:
 def _search(
     key: PRNGKeyArray,
     state: State,
-    expected: Float[Array, "N 4 4"],
+    expected: Float[Array, "K 4 4"],
     image: Image,
     scene: Scene,
     motion: Motion,
@@ -238,12 +246,12 @@ def _search(
     each, _ = shares(hypotheses)
     p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
     blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]
-    best = expected[jnp.argmax(state.log_weight)]
+    best = product(state.motion, state.T_camera_world)[jnp.argmax(state.log_weight)]
     centre = (best[:3, :3] * scene.pivot).sum(-1) + best[:3, 3]
     scale = _scales(motion)
     chart = _Chart(best, centre, jnp.zeros(6), jnp.diag(scale))
     draw_key, pick_key = jax.random.split(jax.random.fold_in(key, 0))
-    index = jax.random.categorical(pick_key, state.log_weight, shape=(each,))
+    index = jax.random.randint(pick_key, (each,), 0, len(expected))
     tried = product(exp_about(_draw_t(draw_key, each) * scale, jnp.zeros(3)), expected[index]).at[0].set(best)
     _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
     means, scales = jax.lax.map(
@@ -308,15 +316,14 @@ def rendered_slopes(
 def _propose(
     key: PRNGKeyArray,
     chart: _Chart,
-    expected: Float[Array, "N 4 4"],
-    log_weight: Float[Array, "N"],
+    expected: Float[Array, "K 4 4"],
     motion: Motion,
     count: int,
 ) -> Float[Array, "D 4 4"]:
-    """Draws from the mixture of what the search learned and the predictive."""
+    """Draws from the mixture of what the search learned and the predictive of equally likely ancestors."""
     keys = jax.random.split(key, 4)
     searched = chart.pose(chart.mean + _draw_t(keys[0], count) @ chart.scale.T)
-    index: Int[Array, "D"] = jax.random.categorical(keys[1], log_weight, shape=(count,))
+    index: Int[Array, "D"] = jax.random.randint(keys[1], (count,), 0, len(expected))
     predicted = product(exp_about(_draw_t(keys[2], count) * _scales(motion), jnp.zeros(3)), expected[index])
     from_motion = jax.random.uniform(keys[3], (count,)) < _FROM_MOTION
     return jnp.where(from_motion[:, None, None], predicted, searched)

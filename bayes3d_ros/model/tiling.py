@@ -41,6 +41,7 @@ def tiles_of_objects(
     library: LibraryArrays,
     half: int,
     everywhere: Bool[Array, ""] | bool = False,
+    tile: int = TILE,
 ) -> Tiles:
     """The tiles that cover the outlines of the grids of each hypothesis' K objects in the image, grown by half a
     window; those of the whole image if `everywhere`. A box that stands askew fills little more than half of its
@@ -68,9 +69,9 @@ def tiles_of_objects(
         return jnp.where(out, jnp.inf, low).min(1), jnp.where(out, -jnp.inf, high).max(1)
 
     top, bottom = pixels(*around(v.min(2), v.max(2)), height)
-    row = top[:, None] + TILE * jnp.arange(-(-height // TILE))
+    row = top[:, None] + tile * jnp.arange(-(-height // tile))
     # The outline between the first and the last line of pixels that the row's windows see.
-    low, high = (a[:, None, :, None] for a in (row - half - _ROUNDING, row + TILE - 1 + half + _ROUNDING))
+    low, high = (a[:, None, :, None] for a in (row - half - _ROUNDING, row + tile - 1 + half + _ROUNDING))
     (u0, u1), (v0, v1) = ([a[:, :, None, e] for e in _EDGES] for a in (u, v))
     slope = (u1 - u0) / jnp.where(jnp.abs(v1 - v0) < 1e-6, 1e-6, v1 - v0)
     inside = (jnp.minimum(v0, v1) <= high) & (jnp.maximum(v0, v1) >= low)
@@ -79,33 +80,43 @@ def tiles_of_objects(
     right = jnp.where(inside, jnp.maximum(*ends), -jnp.inf).max(-1)
     left, right = pixels(*around(left, right), width)
     seen = (row < bottom[:, None]) & (whole | ahead.any(1))[:, None]
-    count = jnp.where(seen, -(-jnp.maximum(right - left, 0) // TILE), 0).ravel()
+    count = jnp.where(seen, -(-jnp.maximum(right - left, 0) // tile), 0).ravel()
     return Tiles(jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count)]), left.ravel(), row.ravel())
 
 
-def over_tiles(work: Callable, carry, tiles: Tiles, count: int, draw: Callable, image: Image, half: int):
+def over_tiles(
+    work: Callable,
+    carry,
+    tiles: Tiles,
+    count: int,
+    draw: Callable,
+    image: Image,
+    half: int,
+    tile: int = TILE,
+    chunk: int = CHUNK,
+):
     """carry = work(carry, hypothesis, u, v, depth with border, real) over every chunk of tiles of `count` hypotheses;
-    draw(hypothesis, rays) gives depth along rays (x, y, 1) of shape [h, w, CHUNK]."""
+    draw(hypothesis, rays) gives depth along rays (x, y, 1) of shape [h, w, chunk]."""
     total, rows = tiles.first[-1], tiles.u.shape[0] // count
     height, width = image.depth.shape
-    offset = jnp.arange(-half, TILE + half)
+    offset = jnp.arange(-half, tile + half)
 
-    def chunk(state):
+    def do_chunk(state):
         start, carry = state
-        index = start + jnp.arange(CHUNK)
+        index = start + jnp.arange(chunk)
         real = index < total
         row = jnp.clip(jnp.searchsorted(tiles.first, index, side="right") - 1, 0, tiles.u.shape[0] - 1)
         n = row // rows
-        u = tiles.u[row] + jnp.where(real, index - tiles.first[row], 0) * TILE
+        u = tiles.u[row] + jnp.where(real, index - tiles.first[row], 0) * tile
         v = tiles.v[row]
-        side = TILE + 2 * half
-        shape = (side, side, CHUNK)
+        side = tile + 2 * half
+        shape = (side, side, chunk)
         x = jnp.broadcast_to((u + offset[:, None] - image.centre[0]) / image.focal[0], shape)
         y = jnp.broadcast_to(((v + offset[:, None] - image.centre[1]) / image.focal[1])[:, None], shape)
         depth = draw(n, (x, y))
         # The scene's image ends at its rim: what is rendered beyond it belongs to no window.
         column, row = u + offset[:, None], (v + offset[:, None])[:, None]
         depth = jnp.where((column >= 0) & (column < width) & (row >= 0) & (row < height), depth, jnp.inf)
-        return start + CHUNK, work(carry, n, u, v, depth, real)
+        return start + chunk, work(carry, n, u, v, depth, real)
 
-    return jax.lax.while_loop(lambda state: state[0] < total, chunk, (jnp.int32(0), carry))[1]
+    return jax.lax.while_loop(lambda state: state[0] < total, do_chunk, (jnp.int32(0), carry))[1]

@@ -11,6 +11,7 @@ Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
 EXPERIMENTS: dict[str, str] = {
     "calibration": "bayes3d_ros.evaluation.experiments.calibration",
     "calibration-points": "bayes3d_ros.evaluation.experiments.calibration_points",
+    "camera-tracking": "bayes3d_ros.evaluation.experiments.camera_tracking",
     "coverage": "bayes3d_ros.evaluation.experiments.coverage",
     "dial": "bayes3d_ros.evaluation.experiments.dial",
     "exactness": "bayes3d_ros.evaluation.experiments.exactness",
