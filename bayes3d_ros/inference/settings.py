@@ -74,10 +74,10 @@ class ParserSettings:
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
     )
     depth_bias: float = setting(
-        0.0015, "standard deviation of depth errors that an object's pixels share", unit="m", low=0.0, high=0.05
+        0.0012, "standard deviation of depth errors that an object's pixels share", unit="m", low=0.0, high=0.05
     )
     depth_waviness: float = setting(
-        0.0017, "standard deviation of depth errors that are waves over an object", unit="m", low=0.0, high=0.05
+        0.0005, "standard deviation of depth errors that are waves over an object", unit="m", low=0.0, high=0.05
     )
     waviness_length: float = setting(
         0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
