@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_image import DEPTH_ENCODINGS, decode_depth, encode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.mcap_files import BagDamage, BagError, RawMessage, Topic, raw_messages, topics
 from bayes3d_ros.model.observation import DepthFrame
 
@@ -174,15 +175,12 @@ class FrameReader:
 
     def _matrix(self, pose: Any) -> Float[np.ndarray, "4 4"]:
         p, q = pose.position, pose.orientation
-        matrix = np.eye(4)
-        matrix[:3, 3] = p.x, p.y, p.z
-        quaternion = np.array([q.x, q.y, q.z, q.w])
-        if not np.isfinite(matrix).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
-            got = " ".join(f"{v:g}" for v in (p.x, p.y, p.z, *quaternion))
+        position, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+        if not np.isfinite(position).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
+            got = " ".join(f"{v:g}" for v in (*position, *quaternion))
             expected = "expected finite poses x y z qx qy qz qw with unit quaternions"
             raise BagError(f"{self.bag}: {self.pose_topic}: {expected}, got {got}")
-        matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-        return matrix
+        return pose_matrix(position, quaternion)
 
 
 class BagWriter:

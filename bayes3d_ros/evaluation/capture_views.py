@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.evaluation.pose_noise import disturbed
 from bayes3d_ros.evaluation.random_scenes import CAMERA, RestingObject, perfect_depth
-from bayes3d_ros.evaluation.scene_file import look_at
+from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.inference.object_learning import Learned
@@ -44,8 +44,7 @@ def capture(
     frames, seen = [], []
     for k in range(views):
         azimuth, pitch = 2 * np.pi * k / views + 0.2, np.radians(PITCHES[k % len(PITCHES)])
-        away = [np.sin(azimuth) * np.cos(pitch), -np.cos(azimuth) * np.cos(pitch), np.sin(pitch)]
-        T_table_camera = look_at(middle + DISTANCE * np.array(away), middle)
+        T_table_camera = look_at(middle + DISTANCE * direction(azimuth - np.pi / 2, pitch), middle)
         clean = perfect_depth(thing, T_table_object, T_table_camera)
         depth = add_sensor_noise(clean.depth, clean.cosine, CAMERA, noise, bias, pixel_rng)
         returned = (clean.solid == 0) & (depth > 0)

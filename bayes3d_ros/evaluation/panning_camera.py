@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.evaluation.ray_casting import RayCaster
-from bayes3d_ros.evaluation.scene_file import look_at
+from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import Intrinsics, project
 from bayes3d_ros.geometry.mesh import load_mesh
@@ -43,8 +43,7 @@ def panning_cameras(model: ObjectModel, frames: int, seed: int) -> list[Float[np
         turn, wave = start + SWEEP * k / 120, 2 * np.pi * k / 120
         distance = DISTANCE + SWAY[0] * np.sin(wave + phase[0])
         pitch = PITCH + SWAY[1] * np.sin(wave + phase[1])
-        away = np.array([np.cos(turn) * np.cos(pitch), np.sin(turn) * np.cos(pitch), np.sin(pitch)])
-        pose = look_at(middle + distance * away, middle)
+        pose = look_at(middle + distance * direction(turn, pitch), middle)
         pose[:3, 3] += rng.normal(0, JITTER[0], 3)
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, JITTER[1], 3)).as_matrix()
         poses.append(pose)
@@ -70,7 +69,6 @@ def independent_frames(
     mesh_file: Path, poses: list[Float[np.ndarray, "4 4"]], seed: int, noise: SensorNoise | None = None
 ) -> Iterator[DepthFrame]:
     """The mesh by MuJoCo's ray casting, with a depth camera's noise, SENSOR pixels across."""
-    noise = noise or SensorNoise()
     noise = noise or SensorNoise()
     caster, camera = RayCaster([(load_mesh(mesh_file), np.eye(4))]), pinhole(SENSOR)
     rng = np.random.default_rng(seed)

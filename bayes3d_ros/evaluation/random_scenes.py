@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.evaluation.correlated_errors import draw_correlated_errors
 from bayes3d_ros.evaluation.ray_casting import RayCaster, Rendering, SimulationError
 from bayes3d_ros.evaluation.resting import placed, resting_normals, turn
-from bayes3d_ros.evaluation.scene_file import look_at
+from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import Intrinsics, project
 from bayes3d_ros.model.observation import DepthFrame
@@ -113,9 +113,8 @@ def _view(
     for _ in range(_MOST_VIEWS):
         distance, pitch = rng.uniform(*DISTANCES), np.radians(rng.uniform(*PITCHES))
         azimuth = rng.uniform(0, 2 * np.pi)
-        away = [np.cos(azimuth) * np.cos(pitch), np.sin(azimuth) * np.cos(pitch), np.sin(pitch)]
         target = middle + np.append(rng.normal(0, AIM, 2), 0)
-        T_table_camera = look_at(target + distance * np.array(away), target)
+        T_table_camera = look_at(target + distance * direction(azimuth, pitch), target)
         low, high = _extent(points, T_table_camera)
         if (low > _BORDER).all() and (high < np.array([CAMERA.width, CAMERA.height]) - _BORDER).all():
             return T_table_camera

@@ -61,6 +61,11 @@ def load_scene(path: Path) -> Scene:
         raise SimulationError(f"{path}: {error}") from None
 
 
+def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
+    """The unit vector at an angle (radians) from x about z, and one above the x-y plane."""
+    return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+
+
 def look_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """T_table_camera of a camera at `eye` whose optical axis meets `target`, with its image upright."""
     z = target - eye

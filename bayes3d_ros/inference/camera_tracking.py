@@ -101,9 +101,9 @@ class CameraTracker:
         before = known.particles
         if abs(ratio - 1) > 0.02:
             before = before._replace(motion=_slower(before.motion, jnp.float32(ratio)))
-        expected = product(before.motion, before.T_camera_world)[jnp.argmax(before.log_weight)]
+        expected = pose_filter.expected_pose(before)
         image = self._image(frame, known.world, np.asarray(expected, np.float64))
-        grid = for_returns(self._grid, image.kind)
+        grid = for_returns(self._grid, image.kind, image.weight)
         motion = pose_filter.Motion(
             jnp.float32(settings.speed_change * seconds), jnp.float32(settings.turn_change * seconds)
         )

@@ -59,8 +59,7 @@ def factor(covariance: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
 
 def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     """Scales of a size that a mode may have: one that followed a ridge without end must not grow without end."""
-    smallest = jnp.eye(3) * jnp.array(_SMALLEST_SPREAD)
-    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, smallest), scale)
+    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(_SMALLEST_SPREAD)), scale)
     excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(_LARGEST_SPREAD)).max(1)
     return scale / jnp.maximum(excess, 1)[:, None, None]
 

@@ -128,7 +128,8 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
 
 
 def near_peak(table: Float[Array, "S P"], grid: NoiseGrid) -> NoiseGrid:
-    """The part of the grid about the best sigma of this table: at half the cost, close enough for a search."""
+    """The part of the grid about the best sigma of this table: at half the cost, and
+    what is left out has no mass where that sigma is near those of the scenes to come."""
     first = jnp.clip(jnp.argmax(table.max(1)) - _NEAR // 2, 0, _SIGMA_STEPS - _NEAR)
     fine = (len(grid.fine.sigma) - 1) // (_SIGMA_STEPS - 1)
     rows = (_NEAR - 1) * fine + 1

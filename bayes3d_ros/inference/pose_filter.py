@@ -94,6 +94,12 @@ def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_o
     )
 
 
+def expected_pose(state: State) -> Float[Array, "4 4"]:
+    """Where the velocity of the likeliest particle leads to: T_camera_world."""
+    best = jnp.argmax(state.log_weight)
+    return product(state.motion[best], state.T_camera_world[best])
+
+
 def _log_t(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """log density of a standard t in six dimensions, given the squared distance from its centre."""
     nu = _FREEDOM
@@ -246,7 +252,7 @@ def _search(
     each, _ = shares(hypotheses)
     p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
     blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]
-    best = product(state.motion, state.T_camera_world)[jnp.argmax(state.log_weight)]
+    best = expected_pose(state)
     centre = (best[:3, :3] * scene.pivot).sum(-1) + best[:3, 3]
     scale = _scales(motion)
     chart = _Chart(best, centre, jnp.zeros(6), jnp.diag(scale))

@@ -6,6 +6,7 @@ everything compiled.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -35,7 +36,8 @@ SIZES = (25, 50, 100, 200)
 HYPOTHESES, FEWER = 2048, (512, 1024)
 FRAMES, QUICK_FRAMES = 120, 10
 FRAMES_OF = ("own", "independent")
-# Frames a second, cm and degrees, on their GPU with a score of plain depth differences (Bayes3D, its tracking table).
+MEASURED = ("fps", "position_cm", "orientation_deg")
+# These on their GPU with a score of plain depth differences (Bayes3D, its tracking table).
 PAPER: dict[str, dict[int, tuple[float, float, float]]] = {
     "mustard_bottle": {
         25: (103.2, 0.130, 1.524), 50: (82.1, 0.002, 0.841), 100: (37.9, 0.002, 0.736), 200: (14.5, 0.002, 0.739)
@@ -91,7 +93,7 @@ def track_row(library: Library, thing: str, size: int, frames: str, hypotheses: 
         recorded, settings = own_frames(model, poses, size), TrackerSettings(sigma_max=NOISELESS)
     else:
         recorded, settings = independent_frames(ycb_mesh(name), poses, seed), TrackerSettings()
-    tracker = CameraTracker(library, _with(settings, size, hypotheses))
+    tracker = CameraTracker(library, replace(settings, score_width=size, hypotheses=hypotheses))
     known = tracker.start(KnownWorld((name,), np.eye(4)[None], table=False), poses[0])
     seconds, position, orientation, lost = [], [], [], 0
     for k, frame in enumerate(recorded):
@@ -115,12 +117,8 @@ def track_row(library: Library, thing: str, size: int, frames: str, hypotheses: 
         "orientation_deg_worst": round(float(np.max(orientation)), 5),
         "lost": lost,
         "count": len(position),
-        "paper": dict(zip(("fps", "position_cm", "orientation_deg"), PAPER[thing][size], strict=True)),
+        "paper": dict(zip(MEASURED, PAPER[thing][size], strict=True)),
     }
-
-
-def _with(settings: TrackerSettings, size: int, hypotheses: int) -> TrackerSettings:
-    return TrackerSettings(sigma_max=settings.sigma_max, score_width=size, hypotheses=hypotheses)
 
 
 def line(row: Row) -> str:
@@ -150,13 +148,14 @@ def _met(row: Row) -> bool:
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Worst mean errors of either kind of frames, frames a second by size, the rows that miss the issue's limits."""
     told: dict[str, Any] = {}
+    table = [row for row in rows if row["hypotheses"] == HYPOTHESES]
     for frames in FRAMES_OF:
-        own = [row for row in rows if row["frames"] == frames and row["hypotheses"] == HYPOTHESES]
+        own = [row for row in table if row["frames"] == frames]
         for what in ("position_cm", "orientation_deg"):
             told[f"worst_{what}_{frames}"] = max((row[what] for row in own), default=None)
         told[f"lost_{frames}"] = sum(row["lost"] for row in own)
-    for size in dict.fromkeys(row["size"] for row in rows):
-        told[f"fps_{size}"] = min(r["fps"] for r in rows if r["size"] == size and r["hypotheses"] == HYPOTHESES)
+    for size in dict.fromkeys(row["size"] for row in table):
+        told[f"fps_{size}"] = min(row["fps"] for row in table if row["size"] == size)
     missed = [f"{row['object']} {row['size']} {row['frames']}" for row in rows if not _met(row)]
     return told | {"not_met": missed}
 
@@ -178,7 +177,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
                 axis.plot([r["size"] for r in own], [r[what] for r in own], style + "o", color=shade, markersize=4,
                           label=f"{thing}, {frames}")  # fmt: skip
             paper = PAPER[thing]
-            column = ("fps", "position_cm", "orientation_deg").index(what)
+            column = MEASURED.index(what)
             axis.plot(list(paper), [p[column] for p in paper.values()], ":x", color=shade, alpha=0.6,
                       label=f"{thing}, paper")  # fmt: skip
         axis.set_xscale("log")
