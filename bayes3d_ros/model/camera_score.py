@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from bayes3d_ros.model.hypothesis_depth import over_depth
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
-from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles, tiles_of_objects
+from bayes3d_ros.model.tiling import LARGE, SMALL, tiles_of_objects
 
-_SMALL, _SMALL_TILE, _SMALL_CHUNK = 64, 4, 512  # pixels across: outlines in smaller images leave large tiles half empty
+_SMALL = 64  # pixels across: outlines in smaller images leave large tiles half empty
 
 
 class World(NamedTuple):
@@ -48,23 +49,23 @@ def log_likelihood_of_cameras(
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
     `image.table` is not used."""
     half = window // 2
-    tile, chunk = (_SMALL_TILE, _SMALL_CHUNK) if image.depth.shape[1] <= _SMALL else (TILE, CHUNK)
+    size = SMALL if image.depth.shape[1] <= _SMALL else LARGE
     count, objects = len(T_camera_world), len(world.type)
     T = product(T_camera_world[:, None], world.T_world_object)
     kinds = jnp.broadcast_to(world.type, (count, objects))
-    tiles = tiles_of_objects(T, kinds, image, library, half, world.table, tile)
+    drawn, scored = (tiles_of_objects(T, kinds, image, library, grown, world.table, size.tile) for grown in (0, half))
 
     def draw(n, rays):
         return depth_along(T_camera_world[n], world, library, rays)
 
     def score(total, n, u, v, depth, real):
-        pixels = observed(image, u, v, (tile, tile))
+        pixels = observed(image, u, v, (size.tile, size.tile))
         value = log_likelihood(depth, pixels, noise, window)
         alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
         return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_tiles(score, start, tiles, count, draw, image, half, tile, chunk)
+    return over_depth(score, start, draw, drawn, scored, count, image, half, size)
 
 
 def depth_along(

@@ -1,51 +1,44 @@
 """Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change."""
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from bayes3d_ros.model.hypothesis_depth import crop, draw_tiles, over_depth, padding
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
-from bayes3d_ros.model.tiling import CHUNK, TILE, over_tiles, tiles_of_objects
-
-
-def border(window: int) -> tuple[int, int]:
-    """Pixels of padding before and after a scene's depth image, so that every tile with its window lies inside."""
-    return window // 2, window // 2 + TILE
+from bayes3d_ros.model.tiling import LARGE, Tiles, tiles_of_objects
 
 
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
-    pad = [(0, 0)] * (depth.ndim - 2) + [border(window)] * 2
+    pad = [(0, 0)] * (depth.ndim - 2) + [padding(window, LARGE)] * 2
     return jnp.pad(depth, pad, constant_values=jnp.inf)
 
 
-def _over_objects(work, carry, contact, image, library, table, half):
-    """`over_tiles` of the objects, drawn one a hypothesis."""
+def _drawing(contact: Contact, image: Image, library: LibraryArrays, table: Table) -> tuple[Callable, Callable]:
+    """Draws object n along rays; tiles of the objects' outlines, grown by so many pixels."""
     T = T_camera_object(contact, library, table)
-    tiles = tiles_of_objects(T[:, None], contact.type[:, None], image, library, half)
 
     def draw(n, rays):
         return renderers["march"](library, contact.type[n], T[n], rays)
 
-    return over_tiles(work, carry, tiles, len(T), draw, image, half)
+    def tiles(grown: int) -> Tiles:
+        return tiles_of_objects(T[:, None], contact.type[:, None], image, library, grown)
 
-
-def _crop(scenes, index, u, v, side):
-    """Square crops of padded scenes; (u, v) are pixels of the unpadded image, the crop starts half a window before."""
-    step = jnp.arange(side)[:, None]
-    return scenes[index, (v + step)[:, None], u + step]
+    return draw, tiles
 
 
 def _twice(pixels: Pixels) -> Pixels:
     """For two scenes' tiles one after the other."""
 
     def both(a: Array) -> Array:
-        layers = a.reshape(*a.shape[:2], -1, 1, CHUNK)
+        layers = a.reshape(*a.shape[:2], -1, 1, LARGE.chunk)
         return jnp.concatenate([layers, layers], 3).reshape(*a.shape[:2], -1)
 
     depth, kind, ray_x, ray_y = (both(a) for a in (pixels.depth, pixels.kind, pixels.ray_x, pixels.ray_y))
@@ -68,19 +61,20 @@ def log_likelihood_gain(
 
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
-    half = window // 2
-    side = TILE + 2 * half
+    half, (tile, chunk) = window // 2, LARGE
+    draw, tiles = _drawing(contact, image, library, table)
 
     def add(gains, n, u, v, depth, real):
-        before = _crop(scenes, ancestor[n], u, v, side)
+        before = crop(scenes, ancestor[n], u, v, tile + 2 * half)
         # Both at once, as twice the tiles: half the code to compile and to load.
         both = jnp.concatenate([before, jnp.minimum(before, depth)], -1)
-        value = log_likelihood(both, _twice(observed(image, u, v, (TILE, TILE))), noise, window)
-        gain = value[..., CHUNK:] - value[..., :CHUNK]
+        value = log_likelihood(both, _twice(observed(image, u, v, (tile, tile))), noise, window)
+        gain = value[..., chunk:] - value[..., :chunk]
         return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
 
-    gains = jnp.zeros((contact.type.shape[0], noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return _over_objects(add, gains, contact, image, library, table, half)
+    count = len(contact.type)
+    gains = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    return over_depth(add, gains, draw, tiles(0), tiles(half), count, image, half, LARGE)
 
 
 @partial(jax.jit, static_argnames="window")
@@ -93,17 +87,10 @@ def draw_objects(
     window: int,
 ) -> Float[Array, "N Hp Wp"]:
     """Scene n with object n rendered into it."""
-    half = window // 2
-    height, width = image.depth.shape
-
-    def draw(drawn, n, u, v, depth, real):
-        step = jnp.arange(TILE)[:, None]
-        rows, columns = (v + step)[:, None], u + step
-        inside = real & (rows < height) & (columns < width)
-        depth = jnp.where(inside, depth[half : half + TILE, half : half + TILE], jnp.inf)
-        return drawn.at[n, half + rows, half + columns].min(depth)
-
-    return _over_objects(draw, scenes, contact, image, library, table, half)
+    draw, tiles = _drawing(contact, image, library, table)
+    drawn = tiles(0)
+    each = drawn.u.shape[0] // len(scenes)
+    return draw_tiles(draw, scenes, drawn, (0, drawn.u.shape[0]), each, image, window // 2, LARGE)
 
 
 def log_likelihood_scene(

@@ -1,7 +1,7 @@
 """The part of the image that each hypothesis can change, cut into tiles.
 
-Tiles of all hypotheses form one list, worked through in chunks of static shape, as many as it takes. Cost grows with
-the pixels that hypotheses cover and no N x H x W image is made.
+Tiles of all hypotheses form one list, worked through in chunks of static shape, as many as it takes: cost grows with
+the pixels that hypotheses cover.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
 
-TILE = 8
-CHUNK = 128
+
+class TileSize(NamedTuple):
+    """Static shapes: pixels across a tile, tiles in a chunk."""
+
+    tile: int = 8
+    chunk: int = 128
+
+
+LARGE, SMALL = TileSize(), TileSize(4, 512)
 
 
 class Tiles(NamedTuple):
@@ -41,7 +48,7 @@ def tiles_of_objects(
     library: LibraryArrays,
     half: int,
     everywhere: Bool[Array, ""] | bool = False,
-    tile: int = TILE,
+    tile: int = LARGE.tile,
 ) -> Tiles:
     """The tiles that cover the outlines of the grids of each hypothesis' K objects in the image, grown by half a
     window; those of the whole image if `everywhere`. A box that stands askew fills little more than half of its
@@ -84,39 +91,17 @@ def tiles_of_objects(
     return Tiles(jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count)]), left.ravel(), row.ravel())
 
 
-def over_tiles(
-    work: Callable,
-    carry,
-    tiles: Tiles,
-    count: int,
-    draw: Callable,
-    image: Image,
-    half: int,
-    tile: int = TILE,
-    chunk: int = CHUNK,
-):
-    """carry = work(carry, hypothesis, u, v, depth with border, real) over every chunk of tiles of `count` hypotheses;
-    draw(hypothesis, rays) gives depth along rays (x, y, 1) of shape [h, w, chunk]."""
-    total, rows = tiles.first[-1], tiles.u.shape[0] // count
-    height, width = image.depth.shape
-    offset = jnp.arange(-half, tile + half)
+def over_tiles(work: Callable, carry, tiles: Tiles, rows: tuple[Array | int, Array | int], each: int, size: TileSize):
+    """carry = work(carry, hypothesis, u, v, real) over chunks of the tiles of rows [begin, end), of which every
+    hypothesis has `each`. A chunk's last tiles may be none: `real` says so."""
+    begin, end = (tiles.first[row] for row in rows)
 
     def do_chunk(state):
         start, carry = state
-        index = start + jnp.arange(chunk)
-        real = index < total
+        index = start + jnp.arange(size.chunk)
+        real = index < end
         row = jnp.clip(jnp.searchsorted(tiles.first, index, side="right") - 1, 0, tiles.u.shape[0] - 1)
-        n = row // rows
-        u = tiles.u[row] + jnp.where(real, index - tiles.first[row], 0) * tile
-        v = tiles.v[row]
-        side = tile + 2 * half
-        shape = (side, side, chunk)
-        x = jnp.broadcast_to((u + offset[:, None] - image.centre[0]) / image.focal[0], shape)
-        y = jnp.broadcast_to(((v + offset[:, None] - image.centre[1]) / image.focal[1])[:, None], shape)
-        depth = draw(n, (x, y))
-        # The scene's image ends at its rim: what is rendered beyond it belongs to no window.
-        column, row = u + offset[:, None], (v + offset[:, None])[:, None]
-        depth = jnp.where((column >= 0) & (column < width) & (row >= 0) & (row < height), depth, jnp.inf)
-        return start + chunk, work(carry, n, u, v, depth, real)
+        u = tiles.u[row] + jnp.where(real, index - tiles.first[row], 0) * size.tile
+        return start + size.chunk, work(carry, row // each, u, tiles.v[row], real)
 
-    return jax.lax.while_loop(lambda state: state[0] < total, do_chunk, (jnp.int32(0), carry))[1]
+    return jax.lax.while_loop(lambda state: state[0] < end, do_chunk, (begin, carry))[1]

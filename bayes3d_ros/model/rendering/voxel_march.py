@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.model.library_arrays import OFFSET_RANGE, LibraryArrays
 
 INFLATION = 0.2  # voxels
-MAX_STEPS = 96
-_FIRST_STEPS, _PACK = 8, 1024
+_FIRST_STEPS = 4  # of all rays alike
+# Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
+_STAGES = ((2, 4), (8, 8), (16, 96))
 _NUDGE = 2e-3  # voxels, past a cube's face
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
@@ -28,7 +29,7 @@ class _Rays(NamedTuple):
     broadcasts against the rays."""
 
     first: Int[Array, "*objects"]
-    dims: tuple[Int[Array, "*objects"], ...]
+    dims: tuple[Float[Array, "*objects"], ...]
     origin: tuple[Float[Array, "*objects"], ...]
     direction: tuple[Float[Array, "*shape"], ...]
     leave: Float[Array, "*shape"]
@@ -52,7 +53,7 @@ def march(
     x, y = rays
     d = [(R[..., 0, a] * x + R[..., 1, a] * y + R[..., 2, a]) / size for a in range(3)]
     d = [jnp.where(jnp.abs(c) < 1e-6, 1e-6, c) for c in d]
-    dims = [library.dims[type_index, a] for a in range(3)]
+    dims = [library.dims[type_index, a].astype(jnp.float32) for a in range(3)]
     low = [-a / c for a, c in zip(eye, d, strict=True)]
     high = [(n - a) / c for n, a, c in zip(dims, eye, d, strict=True)]
     enter, leave = jnp.minimum(low[0], high[0]), jnp.maximum(low[0], high[0])
@@ -60,64 +61,89 @@ def march(
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
     walk = _Rays(library.first[type_index], tuple(dims), tuple(eye), tuple(d), leave)
-    t, hit = jnp.maximum(enter, near) + _nudge(d), jnp.full(rays[0].shape, NO_SURFACE)
-    t, hit = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, s: _advance(library.words, walk, s[0], s[1], near), (t, hit))
-    return _finish(library.words, walk, t, hit, near)
+    t = jnp.maximum(enter, near) + _nudge(d)
+    t = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, t: _advance(library.words, walk, t, near), t)
+    t = _finish(library.words, walk, t.ravel(), near).reshape(t.shape)
+    return jnp.where(t < 0, -t, NO_SURFACE)
 
 
 def _nudge(d: Sequence[Array]) -> Array:
     return _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
 
 
-def _finish(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> Array:
-    """Walk the rays that are left to their ends, a packed batch at a time."""
-    shape, leave = t.shape, walk.leave.ravel()
-    direction = [c.ravel() for c in walk.direction]
+def _on_its_way(t: Array, leave: Array) -> Array:
+    return (t >= 0) & (t < leave)
 
-    def batch(state):
-        t, hit = state
-        index = jnp.nonzero(t < leave, size=min(_PACK, t.size), fill_value=0)[0]
-        place = jnp.unravel_index(index, shape)
 
-        def objects(a: Array) -> Array:
-            return a[place[len(shape) - a.ndim :]]
+def _finish(words: Array, walk: _Rays, t: Float[Array, "R"], near: float) -> Float[Array, "R"]:
+    """Walk the rays that are left to their ends, as far as `_STAGES` lets them."""
+    leave = walk.leave.ravel()
+    for share, steps in _STAGES:
+        size = -(-t.size // share)
+        index, count = _packed(_on_its_way(t, leave), share * size)
 
-        some = _Rays(
-            first=objects(walk.first),
-            dims=tuple(map(objects, walk.dims)),
-            origin=tuple(map(objects, walk.origin)),
-            direction=tuple(c[index] for c in direction),
-            leave=leave[index],
-        )
+        def batch(number, t, size=size, steps=steps, index=index):
+            some = jax.lax.dynamic_slice(index, (number * size,), (size,))
+            rays = _picked(walk, some, leave)
 
-        def unfinished(inner):
-            step, t, _ = inner
-            return (step < MAX_STEPS) & jnp.any(t < some.leave)
+            def go(inner):
+                step, t = inner
+                return step + 1, _advance(words, rays, t, near)
 
-        def go(inner):
-            step, t, hit = inner
-            return step + 1, *_advance(words, some, t, hit, near)
+            def unfinished(inner):
+                step, t = inner
+                return (step < steps) & jnp.any(_on_its_way(t, rays.leave))
 
-        _, _, packed_hit = jax.lax.while_loop(unfinished, go, (0, t[index], hit[index]))
-        return t.at[index].set(jnp.inf), hit.at[index].set(packed_hit)
+            _, moved = jax.lax.while_loop(unfinished, go, (0, t.at[some].get(mode="fill", fill_value=jnp.inf)))
+            return t.at[some].set(moved, mode="drop", unique_indices=True)
 
-    state = t.ravel(), hit.ravel()
-    return jax.lax.while_loop(lambda state: jnp.any(state[0] < leave), batch, state)[1].reshape(shape)
+        t = jax.lax.fori_loop(0, -(-count // size), batch, t)
+    return t
+
+
+def _packed(mask: Bool[Array, "R"], size: int) -> tuple[Int[Array, "size"], Int[Array, ""]]:
+    """The places where the mask holds, then len(mask); and how many they are. In another order than `nonzero`, and at a
+    fifth of its cost: columns are counted side by side."""
+    columns = next(c for c in (256, 64, 16, 1) if mask.size % c == 0)
+    table = mask.reshape(-1, columns)
+    within = jnp.cumsum(table, 0, dtype=jnp.int32)
+    total = jnp.cumsum(within[-1])
+    place = jnp.where(table, within + (total - within[-1]) - 1, size).ravel()
+    index = jnp.full(size, mask.size, jnp.int32)
+    return index.at[place].set(jnp.arange(mask.size), mode="drop", unique_indices=True), total[-1]
+
+
+def _picked(walk: _Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> _Rays:
+    """Some of the rays; those beyond the last have left."""
+    shape = walk.leave.shape
+    place = jnp.unravel_index(jnp.minimum(index, leave.size - 1), shape)
+
+    def objects(a: Array) -> Array:
+        return a[place[len(shape) - a.ndim :]]
+
+    return _Rays(
+        first=objects(walk.first),
+        dims=tuple(map(objects, walk.dims)),
+        origin=tuple(map(objects, walk.origin)),
+        direction=tuple(objects(c) for c in walk.direction),
+        leave=leave.at[index].get(mode="fill", fill_value=-jnp.inf),
+    )
 
 
 def _byte(words: Int[Array, "N"], shift: int) -> Float[Array, "N"]:
     return jax.lax.shift_right_arithmetic(jax.lax.shift_left(words, 24 - shift), 24).astype(jnp.float32)
 
 
-def _advance(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> tuple[Array, Array]:
-    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray is done at t = inf."""
+def _advance(words: Array, walk: _Rays, t: Array, near: float) -> Array:
+    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray that has met a surface at
+    depth z holds -z from then on: with a second array, a CPU would work all of it out twice."""
     o, d, dims = walk.origin, walk.direction, walk.dims
-    active = t < walk.leave
+    active = _on_its_way(t, walk.leave)
     at = jnp.where(active, t, 0.0)
     cell = [jnp.clip(jnp.floor(a + at * c), 0.0, n - 1.0) for a, c, n in zip(o, d, dims, strict=True)]
-    i, j, k = (c.astype(jnp.int32) for c in cell)
+    index = ((cell[0] * dims[1] + cell[1]) * dims[2] + cell[2]).astype(jnp.int32)  # below 2^24: exact
     # A gather that is fused with the arithmetic around it keeps a CPU from vectorising all of it: half the speed.
-    word, *cell = jax.lax.optimization_barrier((words[walk.first + (i * dims[1] + j) * dims[2] + k], *cell))
+    word, *cell = jax.lax.optimization_barrier((words[walk.first + index], *cell))
     surface = (word & -256) != 0
     half = jnp.where(surface, 0.5, (word & 255).astype(jnp.float32) - 0.5)
     from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]
@@ -128,7 +154,6 @@ def _advance(words: Array, walk: _Rays, t: Array, hit: Array, near: float) -> tu
     meet = ahead / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
     reach = [jnp.abs(r + meet * c) for r, c in zip(from_centre, d, strict=True)]
     on_plane = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2]) <= 0.5 + INFLATION
-    met = jnp.where(surface, on_plane & (meet > near), word == 0) & active
-    hit = jnp.where(met, jnp.where(surface, meet, t), hit)
+    met = jnp.where(surface, on_plane & (meet > near), word == 0)
     beyond = jnp.maximum(jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2]), t) + _nudge(d)
-    return jnp.where(met | ~active, jnp.inf, beyond), hit
+    return jnp.where(active, jnp.where(met, jnp.where(surface, -meet, -t), beyond), t)
