@@ -214,7 +214,7 @@ def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     from bayes3d_ros.bags import read_frames
     from bayes3d_ros.evaluation.tracking_results import PICTURE, TrackWriter, plot_track
     from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
-    from bayes3d_ros.inference.compilation import enable_cache
+    from bayes3d_ros.inference.compilation import enable_cache, every_core
     from bayes3d_ros.inference.scene_parsing import SceneParser
     from bayes3d_ros.inference.settings import TrackerSettings
     from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
@@ -225,6 +225,7 @@ def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     models = load_library(library)
     frames = read_frames(bag, topic)
     enable_cache()
+    every_core()
     follower = CameraFollower(CameraTracker(models, settings), SceneParser(models))
     known: Tracking | None = None
     done: list[CameraEstimate] = []
@@ -300,9 +301,10 @@ def demo(out: Path) -> None:
 def evaluate(experiment: str, quick: bool, out: Path) -> None:
     """Measure how right the results are: rows as JSON, a summary and plots."""
     from bayes3d_ros.evaluation import benchmark, experiments
-    from bayes3d_ros.inference.compilation import enable_cache
+    from bayes3d_ros.inference.compilation import enable_cache, every_core
 
     enable_cache()
+    every_core()
     module = experiments.load(experiment)
     notes = module.notes(quick)
     report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": notes, "summary": None}
@@ -350,12 +352,11 @@ def bench(file: Path | None) -> None:
     """Measure how fast this machine is."""
     import json
 
-    if hasattr(os, "sched_getaffinity"):  # before jax is imported: hypotheses are shared out over the cores
-        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(len(os.sched_getaffinity(0))))
     from bayes3d_ros.evaluation import benchmark, kernel_speed
-    from bayes3d_ros.inference.compilation import enable_cache
+    from bayes3d_ros.inference.compilation import enable_cache, every_core
 
     enable_cache()
+    every_core()
     report: dict[str, Any] = {
         "machine": benchmark.machine(),
         "versions": benchmark.versions(),

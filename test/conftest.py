@@ -1,6 +1,9 @@
 """Made-up posteriors for tests of what is done with them."""
 
+import os
 from collections.abc import Callable
+
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")  # whichever test begins; test_sharding asks for more
 
 import numpy as np
 import pytest

@@ -200,7 +200,6 @@ def test_a_mistake_of_the_program_is_one_line_too(bag, library, parsers, tmp_pat
 
 
 def test_bench_finds_out_early_that_it_cannot_write(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # or the command would set it, for the tests to come
     monkeypatch.setattr("bayes3d_ros.evaluation.kernel_speed.rows", lambda: pytest.fail("measured first"))
     (tmp_path / "file").write_text("")
     assert_one_line(run("bench", "--json", tmp_path / "file" / "bench.json"), 2, tmp_path / "file")

@@ -153,7 +153,6 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
         return benchmark._row(what, case, "640x480", [1.0], 0)
 
     monkeypatch.setenv("BAYES3D_DATA", str(tmp_path))
-    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # or the command would set it, for the tests to come
     scored = [
         kernel_speed.row("render+score", backend, 100, 2048, [s]) for backend, s in (("ours", 1.0), ("open3d", 2.0))
     ]

@@ -17,6 +17,7 @@ import numpy as np
 import bayes3d_ros
 from bayes3d_ros.bags import read_frames
 from bayes3d_ros.geometry.mesh import MeshError
+from bayes3d_ros.inference.compilation import cores, enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.model.objects import Library, load_library
@@ -117,8 +118,6 @@ def start_row(what: str, case: Case, library: Path, cache: Path) -> dict[str, An
 
 def first_result(bag: str, library: str) -> None:
     """What `start_row` times, in its own process."""
-    from bayes3d_ros.inference.compilation import enable_cache
-
     enable_cache()
     frame = next(iter(read_frames(Path(bag))))
     SceneParser(load_library(Path(library))).parse(frame)
@@ -156,10 +155,9 @@ def machine() -> dict[str, Any]:
         platform.processor() or platform.machine(),
     )
     memory = next((int(text.split()[1]) // 1024 for text in _lines("/proc/meminfo") if text.startswith("MemTotal")), 0)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "cpu": cpu,
-        "cores": cores,
+        "cores": cores(),
         "memory_mib": memory,
         "device": jax.devices()[0].device_kind,
         "system": platform.platform(),

@@ -28,6 +28,7 @@ from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.pose_statistics import rotation_mean, second_moment
 from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.sharding import on_all
 
 _NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
 _NEAR_OBJECT = 0.08  # metres from an object's sphere in which a return may still be its own
@@ -55,13 +56,16 @@ class Tracking:
 class CameraTracker:
     """Holds a library and compiled code; what is known of a camera is handed in and out, frame by frame.
 
-    Compiled once for the images' size and the number of objects in the world.
+    Compiled once for the images' size and the number of objects in the world. Hypotheses are shared out over all of
+    JAX's devices; `every_core` (`inference/compilation.py`) makes the cores of a CPU devices.
     """
 
     def __init__(self, library: Library, settings: TrackerSettings = TrackerSettings()) -> None:
         self.library, self.settings = library, settings
-        self._arrays = library_arrays(library)
-        self._grid = noise_grid(settings.sigma_max, _FINE)
+        self._devices = tuple(jax.devices())
+        # What every frame needs lies on every device once, and is not carried there again and again.
+        self._arrays = on_all(library_arrays(library), self._devices)
+        self._grid = on_all(noise_grid(settings.sigma_max, _FINE), self._devices)
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._smooth = jax.jit(_smooth_covariance)
@@ -79,12 +83,12 @@ class CameraTracker:
         placed = jnp.asarray(world.T_world_object, jnp.float32)
         pivot = jnp.asarray(self._spheres(world)[0].mean(0), jnp.float32)
         scene = pose_filter.Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
-        return Tracking(world, scene, self._at_rest(T_world_camera))
+        return Tracking(world, on_all(scene, self._devices), self._at_rest(T_world_camera))
 
     def _at_rest(self, T_world_camera: Float[np.ndarray, "4 4"]) -> pose_filter.State:
         _, own = pose_filter.shares(self.settings.hypotheses)
         T_camera_world = jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32)
-        return pose_filter.start(T_camera_world, own, 0.4 * self.settings.sigma_max)
+        return on_all(pose_filter.start(T_camera_world, own, 0.4 * self.settings.sigma_max), self._devices)
 
     def step(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         """The posterior one frame later. Raises TrackingError for a frame without returns, or one that is not newer
@@ -109,7 +113,7 @@ class CameraTracker:
         )
         key = frame_key(settings.seed, frame.stamp_ns)
         particles, info = pose_filter.step(
-            key, before, image, known.scene, grid, motion, settings.hypotheses, settings.window
+            key, before, image, known.scene, grid, motion, settings.hypotheses, settings.window, self._devices
         )
         smooth, explained, in_sight = self._smooth(info.T_camera_world, image, known.scene, self._error)
         T_camera_world, log_weight, info, smooth, explained, in_sight = jax.device_get(
@@ -183,7 +187,7 @@ class CameraTracker:
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
         rays = camera.rays()
-        return Image(
+        image = Image(
             depth=jnp.asarray(np.where(returned, depth, 0.0), jnp.float32),
             kind=jnp.asarray(self._kinds(points, world, T_camera_world), jnp.int32),
             ray_x=jnp.asarray(rays[0, :, 0]),
@@ -194,6 +198,7 @@ class CameraTracker:
             outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
             front_margin=jnp.float32(3 * settings.sigma_max),
         )
+        return on_all(image, self._devices)
 
     def _kinds(
         self, points: Float[np.ndarray, "H W 3"], world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]

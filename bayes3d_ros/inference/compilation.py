@@ -1,5 +1,6 @@
-"""Where compiled code is kept between runs."""
+"""Where compiled code is kept between runs, and what it runs on."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -16,3 +17,17 @@ def enable_cache() -> Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     return folder
+
+
+def every_core() -> None:
+    """Make each core of a CPU one of JAX's devices, over which hypotheses can be shared out: compiled loops run on one
+    core. Once something has been computed it is too late, and a number that the user set ($JAX_NUM_CPU_DEVICES)
+    stays."""
+    if "JAX_NUM_CPU_DEVICES" not in os.environ:
+        with contextlib.suppress(RuntimeError):  # JAX has begun, with the devices that it has
+            jax.config.update("jax_num_cpu_devices", cores())
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

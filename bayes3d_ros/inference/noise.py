@@ -127,17 +127,17 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
     return step
 
 
-def near_peak(table: Float[Array, "S P"], grid: NoiseGrid) -> NoiseGrid:
-    """The part of the grid about the best sigma of this table: at half the cost, and
+def near_peak(table: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -> NoiseGrid:
+    """The part of the grid, `count` coarse sigmas, about the best sigma of this table: at a fraction of the cost, and
     what is left out has no mass where that sigma is near those of the scenes to come."""
-    first = jnp.clip(jnp.argmax(table.max(1)) - _NEAR // 2, 0, _SIGMA_STEPS - _NEAR)
+    first = jnp.clip(jnp.argmax(table.max(1)) - count // 2, 0, _SIGMA_STEPS - count)
     fine = (len(grid.fine.sigma) - 1) // (_SIGMA_STEPS - 1)
-    rows = (_NEAR - 1) * fine + 1
+    rows = (count - 1) * fine + 1
     part = jax.lax.dynamic_slice_in_dim
     return NoiseGrid(
-        coarse=grid.coarse._replace(sigma=part(grid.coarse.sigma, first, _NEAR)),
+        coarse=grid.coarse._replace(sigma=part(grid.coarse.sigma, first, count)),
         fine=grid.fine._replace(sigma=part(grid.fine.sigma, first * fine, rows)),
-        to_fine_sigma=jnp.float32(CubicSpline(np.arange(_NEAR), np.eye(_NEAR))(np.arange(rows) / fine)),
+        to_fine_sigma=jnp.float32(CubicSpline(np.arange(count), np.eye(count))(np.arange(rows) / fine)),
         to_fine_p=grid.to_fine_p,
         log_mass=part(grid.log_mass, first * fine, rows),
         p_error=grid.p_error,

@@ -25,10 +25,11 @@ from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.resampling import effective_fraction, normalised, systematic
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
-from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.image import Image, halved
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 from bayes3d_ros.model.motions import exp_about, inverse, log_about, log_volume, product, rigid
+from bayes3d_ros.model.sharding import over_devices
 
 _FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
 _BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by round: before alignment, and after
@@ -40,7 +41,9 @@ _DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
 _RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
 _KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
 _WIDEN = 1.2  # of the scale learned from a round, for the next
-_ANCESTORS = 64  # of the particles, that draws may have moved from
+_ANCESTORS = 32  # of the particles, that draws may have moved from
+_NOISE_LEVELS = 3  # coarse sigmas that draws are scored at: of pixels there are enough to tell sigma to a tenth
+_ALIGNED = 64  # pixels across, at most, of the images that alignment looks at: slopes are of whole images
 _FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
 _SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
 
@@ -94,6 +97,7 @@ def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_o
     )
 
 
+@jax.jit
 def expected_pose(state: State) -> Float[Array, "4 4"]:
     """Where the velocity of the likeliest particle leads to: T_camera_world."""
     best = jnp.argmax(state.log_weight)
@@ -171,7 +175,7 @@ def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D
     return chart._replace(mean=mean, scale=unit[:, None] * jnp.linalg.cholesky(square))
 
 
-@partial(jax.jit, static_argnames=("hypotheses", "window"))
+@partial(jax.jit, static_argnames=("hypotheses", "window", "devices"))
 def step(
     key: PRNGKeyArray,
     state: State,
@@ -181,9 +185,11 @@ def step(
     motion: Motion,
     hypotheses: int,
     window: int,
+    devices: tuple[jax.Device, ...] = (),
 ) -> tuple[State, Info]:
     """The posterior one frame later, with `hypotheses` images scored or rendered in all; of the state's particles there
-    have to be as many as `shares` says."""
+    have to be as many as `shares` says. The work is shared out over `devices`; with several of them `state` has to be
+    on all (`on_all`)."""
     _, own = shares(hypotheses)
     if len(state.log_weight) != own:
         raise ValueError(f"expected {own} particles of {hypotheses} hypotheses, got {len(state.log_weight)}")
@@ -193,19 +199,21 @@ def step(
     log_share = jnp.full(len(kept), -jnp.log(len(kept)))
     expected = product(motions, before)
 
-    def score(T: Float[Array, "D 4 4"], noise: Noise) -> Float[Array, "D S P"]:
-        return log_likelihood_of_cameras(T, scene.world, image, scene.library, noise, window)
+    every_camera = over_devices(partial(log_likelihood_of_cameras, window=window), devices)
 
-    chart = _search(search_key, state, expected, image, scene, motion, hypotheses, score)
+    def score(T: Float[Array, "D 4 4"], noise: Noise) -> Float[Array, "D S P"]:
+        return every_camera(T, scene.world, image, scene.library, noise)
+
+    chart = _search(search_key, state, expected, image, scene, motion, hypotheses, score, devices)
     T = _propose(draw_key, chart, expected, motion, own)
-    by_ancestor = log_predictive(T, expected, log_share, motion)
+    by_ancestor = over_devices(log_predictive, devices)(T, expected, log_share, motion)
     log_prior = jax.nn.logsumexp(by_ancestor, 1)
     log_q = jnp.logaddexp(
         jnp.log1p(-_FROM_MOTION) + chart.log_density(T),
         jnp.log(_FROM_MOTION) + log_prior,
     )
     # Noise about the best for the pose that the search ended at: no draw has a say in it, and the rest has no mass.
-    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid)
+    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, _NOISE_LEVELS)
     table = score(T, near.coarse)
     log_likelihood = noise_model.log_marginal(table, near)
     log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
@@ -246,6 +254,7 @@ def _search(
     motion: Motion,
     hypotheses: int,
     score: Callable[[Float[Array, "D 4 4"], Noise], Float[Array, "D S P"]],
+    devices: tuple[jax.Device, ...],
 ) -> _Chart:
     """A distribution near the likelihood's: draws of the predictive at a blurred noise, the best of them aligned to the
     image, the best of those narrowed round by round."""
@@ -260,9 +269,11 @@ def _search(
     index = jax.random.randint(pick_key, (each,), 0, len(expected))
     tried = product(exp_about(_draw_t(draw_key, each) * scale, jnp.zeros(3)), expected[index]).at[0].set(best)
     _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
-    means, scales = jax.lax.map(
-        lambda start: _aligned(chart, start, image, scene, scale, state.sigma), chart.tangent(tried[starts])
-    )
+    coarse = image
+    while coarse.depth.shape[1] > _ALIGNED:
+        coarse = halved(coarse)
+    align = over_devices(_all_aligned, devices)
+    means, scales = align(chart.tangent(tried[starts]), chart, coarse, scene, scale, state.sigma)
     pick = jnp.argmax(score(chart.pose(means), blurs[1])[:, 0, 0])
     chart = chart._replace(mean=means[pick], scale=scales[pick])
     for number, noise in enumerate(blurs[1:], 1):
@@ -270,6 +281,12 @@ def _search(
         tangent = (chart.mean + step).at[0].set(chart.mean)
         chart = _learned(chart, tangent, score(chart.pose(tangent), noise)[:, 0, 0])
     return chart
+
+
+def _all_aligned(
+    starts: Float[Array, "S 6"], chart: _Chart, image: Image, scene: Scene, scale: Float[Array, "6"], sigma: Array
+) -> tuple[Float[Array, "S 6"], Float[Array, "S 6 6"]]:
+    return jax.lax.map(lambda start: _aligned(chart, start, image, scene, scale, sigma), starts)
 
 
 def _aligned(

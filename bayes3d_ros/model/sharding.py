@@ -2,21 +2,23 @@
 devices where JAX is told so (`jax_num_cpu_devices`): a loop over tiles runs on one core only."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
+
+Tree = TypeVar("Tree")
 
 
 def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Callable[..., Any]:
     """score(hypotheses, *shared), arrays with a row for each hypothesis to arrays with a row for each, as a function
     that gives the same and computes it on all devices; `shared` is needed by every one of them."""
-    if len(devices) == 1:
+    if len(devices) <= 1:
         return score
-    mesh, split = Mesh(np.array(devices), ("hypotheses",)), PartitionSpec("hypotheses")
+    mesh, split = _mesh(devices), PartitionSpec("hypotheses")
 
     def sharded(hypotheses: Any, *shared: Any) -> Any:
         count = len(jax.tree.leaves(hypotheses)[0])
@@ -30,6 +32,17 @@ def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Ca
         found = jax.shard_map(score, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(
             jax.tree.map(even, hypotheses), *shared
         )
+        # On every device again: what follows is small, and would otherwise be cut up as the compiler sees fit.
+        found = jax.lax.with_sharding_constraint(found, NamedSharding(mesh, PartitionSpec()))
         return jax.tree.map(lambda a: a[:count], found)
 
     return sharded
+
+
+def on_all(arrays: Tree, devices: Sequence[jax.Device]) -> Tree:
+    """Copies on every device, as results of `over_devices` are: what goes in as it comes out is compiled once."""
+    return arrays if len(devices) <= 1 else jax.device_put(arrays, NamedSharding(_mesh(devices), PartitionSpec()))
+
+
+def _mesh(devices: Sequence[jax.Device]) -> Mesh:
+    return Mesh(np.array(devices), ("hypotheses",))

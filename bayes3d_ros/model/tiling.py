@@ -23,7 +23,7 @@ class TileSize(NamedTuple):
     chunk: int = 128
 
 
-LARGE, SMALL = TileSize(), TileSize(4, 512)
+LARGE, SMALL = TileSize(), TileSize(4, 256)
 
 
 class Tiles(NamedTuple):

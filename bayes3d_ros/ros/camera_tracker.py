@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
-from bayes3d_ros.inference.compilation import enable_cache
+from bayes3d_ros.inference.compilation import enable_cache, every_core
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
@@ -228,6 +228,7 @@ def main(args: list[str] | None = None) -> int:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
     with contextlib.suppress(OSError):  # a home that cannot be written to costs a compilation, not the node
         enable_cache()
+    every_core()
     return run(CameraTrackerNode, args)
 
 
