@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.model.hypothesis_depth import over_depth
+from bayes3d_ros.model.hypothesis_depth import in_one_kernel, over_depth
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
@@ -48,6 +48,8 @@ def log_likelihood_of_cameras(
     """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
     `image.table` is not used."""
+    if in_one_kernel(image):
+        return _in_one_kernel(T_camera_world, world, image, library, noise, window)
     half = window // 2
     size = SMALL if image.depth.shape[1] <= _SMALL else LARGE
     count, objects = len(T_camera_world), len(world.type)
@@ -66,6 +68,27 @@ def log_likelihood_of_cameras(
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
     return over_depth(score, start, draw, drawn, scored, count, image, half, size)
+
+
+def _in_one_kernel(
+    T_camera_world: Float[Array, "N 4 4"],
+    world: World,
+    image: Image,
+    library: LibraryArrays,
+    noise: Noise,
+    window: int,
+) -> Float[Array, "N S P"]:
+    from bayes3d_ros.model.fused_score import Drawn, fused_gain  # Pallas takes a while to import
+
+    normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
+    plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
+    drawn = Drawn(
+        type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
+        T_camera_object=product(T_camera_world[:, None], world.T_world_object),
+        plane=jnp.where(world.table, plane, 0.0),
+        everywhere=world.table,
+    )
+    return fused_gain(drawn, None, image, library, noise, window)
 
 
 def depth_along(

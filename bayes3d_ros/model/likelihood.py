@@ -84,12 +84,27 @@ def inlier_density(
     """The mixture over the window for every sigma, per metre; `rendered` has a border of window // 2 pixels around."""
     half = window // 2
     height, width = pixels.depth.shape[:2]
+
+    def beside(dv: int, du: int) -> Float[Array, "h w T"]:
+        return rendered[half + dv : half + dv + height, half + du : half + du + width]
+
+    # All sigmas in one expression of the window: a copy of it for each would be slower, and slow to compile.
+    density, seen = ray_mixture(beside, pixels, sigma[:, None, None, None], window, lateral)
+    return jnp.where(seen, density, outlier_density(pixels))
+
+
+def ray_mixture(
+    beside: Callable[[int, int], Array], pixels: Pixels, sigma: Array, window: int, lateral: float = LATERAL
+) -> tuple[Array, Array]:
+    """The mixture over the surface points of the window, and whether there are any. beside(dv, du) is the rendered
+    depth so many pixels away; sigma broadcasts against it."""
+    half = window // 2
     a, b = pixels.ray_x, pixels.ray_y
     norm2 = 1 + a * a + b * b
     across, along = [], []  # squared distances from the ray, and along it, of every point in the window
     for dv in range(-half, half + 1):
         for du in range(-half, half + 1):
-            y = rendered[half + dv : half + dv + height, half + du : half + du + width]
+            y = beside(dv, du)
             surface = jnp.isfinite(y)
             y = jnp.where(surface, y, 0.0)
             ex, ey = du * pixels.step_x, dv * pixels.step_y
@@ -99,16 +114,13 @@ def inlier_density(
     nearest = across[0]
     for d in across[1:]:
         nearest = jnp.minimum(nearest, d)
-    # All sigmas in one expression of the window: a copy of it for each would be slower, and slow to compile.
-    sigma = sigma[:, None, None, None]
     scale = -0.5 / sigma**2
-    both = weight = jnp.zeros((len(sigma), *norm2.shape))
+    both = weight = jnp.zeros(jnp.broadcast_shapes(jnp.shape(sigma), jnp.shape(norm2)))
     for d, q in zip(across, along, strict=True):
         w = jnp.exp(scale * (d - nearest)) + jnp.where(d < _FAR_AWAY, lateral, 0.0)
         both += w * jnp.exp(scale * q)
         weight += w
-    density = both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma)
-    return jnp.where(nearest < _FAR_AWAY, density, outlier_density(pixels))
+    return both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma), nearest < _FAR_AWAY
 
 
 def point_density(
@@ -157,18 +169,22 @@ def log_likelihood(
     rendered = jnp.concatenate([rendered] * layers, -1) if layers > 1 else rendered
     half = window // 2
     height, width = pixels.depth.shape[:2]
-    a = outlier_density(pixels)
-    # Whatever the pixel's kind, its likelihood is p_out outlier + (1 - p_out) inlier.
-    in_front = rendered[half : half + height, half : half + width] < pixels.depth + pixels.front_margin
-    beyond = jnp.where(in_front, 0.0, a)
     inlier = likelihoods[pixels.likelihood.name](rendered, pixels, noise.sigma, window)
-    inlier = jnp.where(pixels.kind == IN_WORKSPACE, inlier, jnp.where(pixels.kind == BEYOND, beyond, 1.0))
-    outlier = jnp.where(pixels.kind == NO_RETURN, 1.0, a)
+    outlier, inlier = by_kind(pixels, rendered[half : half + height, half : half + width], inlier)
     tiles = outlier.shape[-1]
     at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
     total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
     return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
+
+
+def by_kind(pixels: Pixels, rendered: Float[Array, "h w T"], inlier: Array) -> tuple[Array, Array]:
+    """The outliers' and the inliers' densities of pixels of every kind, whose likelihood is p_out outlier +
+    (1 - p_out) inlier; given `inlier` is that of returns in the workspace."""
+    a = outlier_density(pixels)
+    beyond = jnp.where(rendered < pixels.depth + pixels.front_margin, 0.0, a)
+    inlier = jnp.where(pixels.kind == IN_WORKSPACE, inlier, jnp.where(pixels.kind == BEYOND, beyond, 1.0))
+    return jnp.where(pixels.kind == NO_RETURN, 1.0, a), inlier
 
 
 def _sum_log(

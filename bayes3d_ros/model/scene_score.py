@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.model.hypothesis_depth import crop, draw_tiles, over_depth, padding
+from bayes3d_ros.model.hypothesis_depth import crop, draw_tiles, in_one_kernel, over_depth, padding
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
@@ -61,6 +61,12 @@ def log_likelihood_gain(
 
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
+    if in_one_kernel(image):
+        from bayes3d_ros.model.fused_score import Drawn, Scenes, fused_gain  # Pallas takes a while to import
+
+        T = T_camera_object(contact, library, table)[:, None]
+        drawn = Drawn(contact.type[:, None], T, plane=jnp.zeros((len(T), 4)))
+        return fused_gain(drawn, Scenes(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
     draw, tiles = _drawing(contact, image, library, table)
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayes3d_ros.model import scene_score
 from bayes3d_ros.model.image import FreePoints, Image, halved
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.model.rendering import renderers
@@ -102,12 +103,20 @@ def test_objects_are_in_the_image_partly_outside_and_behind(drawn, at_the_rim):
     assert (covered[44:47] == 0).all()
 
 
-@pytest.fixture(scope="module")
-def gains(contacts, drawn, ancestors, image, arrays, table):
-    """Gains of the contacts, each over one of the ancestors, tile by tile; and from whole images."""
+def gain_in_one_kernel(*arguments):
+    """The GPU's kernel, interpreted."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_score, "in_one_kernel", lambda image: True)
+        return jax.jit(log_likelihood_gain.__wrapped__, static_argnames="window")(*arguments)
+
+
+@pytest.fixture(scope="module", params=["tiles", "one kernel"])
+def gains(request, contacts, drawn, ancestors, image, arrays, table):
+    """Gains of the contacts, each over one of the ancestors, by either way; and from whole images."""
     ancestor = np.arange(len(drawn)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
-    gain = np.asarray(gain_of(contacts, jnp.asarray(ancestor), scenes, image, arrays, table, NOISE, WINDOW))
+    gain_by = gain_of if request.param == "tiles" else gain_in_one_kernel
+    gain = np.asarray(gain_by(contacts, jnp.asarray(ancestor), scenes, image, arrays, table, NOISE, WINDOW))
     after = np.minimum(ancestors[ancestor], drawn)
     after = np.asarray(whole(pad_scene(jnp.asarray(after), WINDOW), image, NOISE, WINDOW))
     before = np.asarray(whole(scenes, image, NOISE, WINDOW))[ancestor]

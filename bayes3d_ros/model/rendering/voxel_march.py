@@ -7,7 +7,7 @@ between planes that differ. Everything is arithmetic on whole arrays and one 32-
 Most rays end within a few steps and a few graze on for dozens: after the first steps those left are packed together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -20,11 +20,12 @@ INFLATION = 0.2  # voxels
 _FIRST_STEPS = 4  # of all rays alike
 # Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
 _STAGES = ((2, 4), (8, 8), (16, 96))
+MOST_STEPS = _FIRST_STEPS + sum(steps for _, steps in _STAGES)
 _NUDGE = 2e-3  # voxels, past a cube's face
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
 
-class _Rays(NamedTuple):
+class Rays(NamedTuple):
     """Rays in voxel units of the grid that each walks through. What belongs to the object is one element a ray too, or
     broadcasts against the rays."""
 
@@ -47,23 +48,48 @@ def march(
 
     `objects` broadcasts against `shape` from the right: rays of shape [h, w, N] walk through N objects.
     """
-    size = library.voxel_size[type_index]
-    R, t = T_camera_object[..., :3, :3], T_camera_object[..., :3, 3]
-    eye = [(-sum(R[..., b, a] * t[..., b] for b in range(3)) - library.origin[type_index, a]) / size for a in range(3)]
+    T = T_camera_object
+    walk, t = enter_grid(
+        library.first[type_index],
+        [library.dims[type_index, a].astype(jnp.float32) for a in range(3)],
+        [library.origin[type_index, a] for a in range(3)],
+        library.voxel_size[type_index],
+        [[T[..., b, a] for a in range(4)] for b in range(3)],
+        rays,
+        near,
+    )
+    t = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, t: advance(_look_up(library.words), walk, t, near), t)
+    t = _finish(library.words, walk, t.ravel(), near).reshape(t.shape)
+    return depth_met(t)
+
+
+def enter_grid(
+    first: Array,
+    dims: Sequence[Array],
+    origin: Sequence[Array],
+    size: Array,
+    T_camera_object: Sequence[Sequence[Array]],
+    rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
+    near: float,
+) -> tuple[Rays, Float[Array, "*shape"]]:
+    """Rays (x, y, 1) in the voxels of a grid, and where they enter it. The grid's numbers, and those of the rows of the
+    pose, broadcast against the rays."""
+    T, axes = T_camera_object, range(3)
+    eye = [(-sum(T[b][a] * T[b][3] for b in axes) - origin[a]) / size for a in axes]
     x, y = rays
-    d = [(R[..., 0, a] * x + R[..., 1, a] * y + R[..., 2, a]) / size for a in range(3)]
+    d = [(T[0][a] * x + T[1][a] * y + T[2][a]) / size for a in axes]
     d = [jnp.where(jnp.abs(c) < 1e-6, 1e-6, c) for c in d]
-    dims = [library.dims[type_index, a].astype(jnp.float32) for a in range(3)]
     low = [-a / c for a, c in zip(eye, d, strict=True)]
     high = [(n - a) / c for n, a, c in zip(dims, eye, d, strict=True)]
     enter, leave = jnp.minimum(low[0], high[0]), jnp.maximum(low[0], high[0])
     for a in (1, 2):
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
-    walk = _Rays(library.first[type_index], tuple(dims), tuple(eye), tuple(d), leave)
-    t = jnp.maximum(enter, near) + _nudge(d)
-    t = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, t: _advance(library.words, walk, t, near), t)
-    t = _finish(library.words, walk, t.ravel(), near).reshape(t.shape)
+    return Rays(first, tuple(dims), tuple(eye), tuple(d), leave), jnp.maximum(enter, near) + _nudge(d)
+
+
+def depth_met(t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Depth of what rays have met, from their states after the last step."""
     return jnp.where(t < 0, -t, NO_SURFACE)
 
 
@@ -71,16 +97,16 @@ def _nudge(d: Sequence[Array]) -> Array:
     return _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
 
 
-def _on_its_way(t: Array, leave: Array) -> Array:
+def on_its_way(t: Array, leave: Array) -> Array:
     return (t >= 0) & (t < leave)
 
 
-def _finish(words: Array, walk: _Rays, t: Float[Array, "R"], near: float) -> Float[Array, "R"]:
+def _finish(words: Array, walk: Rays, t: Float[Array, "R"], near: float) -> Float[Array, "R"]:
     """Walk the rays that are left to their ends, as far as `_STAGES` lets them."""
     leave = walk.leave.ravel()
     for share, steps in _STAGES:
         size = -(-t.size // share)
-        index, count = _packed(_on_its_way(t, leave), share * size)
+        index, count = _packed(on_its_way(t, leave), share * size)
 
         def batch(number, t, size=size, steps=steps, index=index):
             some = jax.lax.dynamic_slice(index, (number * size,), (size,))
@@ -88,11 +114,11 @@ def _finish(words: Array, walk: _Rays, t: Float[Array, "R"], near: float) -> Flo
 
             def go(inner):
                 step, t = inner
-                return step + 1, _advance(words, rays, t, near)
+                return step + 1, advance(_look_up(words), rays, t, near)
 
             def unfinished(inner):
                 step, t = inner
-                return (step < steps) & jnp.any(_on_its_way(t, rays.leave))
+                return (step < steps) & jnp.any(on_its_way(t, rays.leave))
 
             _, moved = jax.lax.while_loop(unfinished, go, (0, t.at[some].get(mode="fill", fill_value=jnp.inf)))
             return t.at[some].set(moved, mode="drop", unique_indices=True)
@@ -113,7 +139,7 @@ def _packed(mask: Bool[Array, "R"], size: int) -> tuple[Int[Array, "size"], Int[
     return index.at[place].set(jnp.arange(mask.size), mode="drop", unique_indices=True), total[-1]
 
 
-def _picked(walk: _Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> _Rays:
+def _picked(walk: Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> Rays:
     """Some of the rays; those beyond the last have left."""
     shape = walk.leave.shape
     place = jnp.unravel_index(jnp.minimum(index, leave.size - 1), shape)
@@ -121,7 +147,7 @@ def _picked(walk: _Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> _R
     def objects(a: Array) -> Array:
         return a[place[len(shape) - a.ndim :]]
 
-    return _Rays(
+    return Rays(
         first=objects(walk.first),
         dims=tuple(map(objects, walk.dims)),
         origin=tuple(map(objects, walk.origin)),
@@ -134,16 +160,24 @@ def _byte(words: Int[Array, "N"], shift: int) -> Float[Array, "N"]:
     return jax.lax.shift_right_arithmetic(jax.lax.shift_left(words, 24 - shift), 24).astype(jnp.float32)
 
 
-def _advance(words: Array, walk: _Rays, t: Array, near: float) -> Array:
+def _look_up(words: Int[Array, "V"]) -> Callable:
+    def look_up(index: Array, cell: list[Array]) -> tuple[Array, list[Array]]:
+        # A gather that is fused with the arithmetic around it keeps a CPU from vectorising all of it: half the speed.
+        word, *cell = jax.lax.optimization_barrier((words[index], *cell))
+        return word, cell
+
+    return look_up
+
+
+def advance(look_up: Callable, walk: Rays, t: Array, near: float) -> Array:
     """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray that has met a surface at
     depth z holds -z from then on: with a second array, a CPU would work all of it out twice."""
     o, d, dims = walk.origin, walk.direction, walk.dims
-    active = _on_its_way(t, walk.leave)
+    active = on_its_way(t, walk.leave)
     at = jnp.where(active, t, 0.0)
     cell = [jnp.clip(jnp.floor(a + at * c), 0.0, n - 1.0) for a, c, n in zip(o, d, dims, strict=True)]
     index = ((cell[0] * dims[1] + cell[1]) * dims[2] + cell[2]).astype(jnp.int32)  # below 2^24: exact
-    # A gather that is fused with the arithmetic around it keeps a CPU from vectorising all of it: half the speed.
-    word, *cell = jax.lax.optimization_barrier((words[walk.first + index], *cell))
+    word, cell = look_up(walk.first + index, cell)
     surface = (word & -256) != 0
     half = jnp.where(surface, 0.5, (word & 255).astype(jnp.float32) - 0.5)
     from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]

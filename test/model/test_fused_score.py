@@ -1,0 +1,48 @@
+"""The GPU's kernel where there is no GPU: it is lowered to Triton for one. What it computes is compared with the
+reference in test_camera_score.py and test_scene_score.py."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AbstractDevice, AbstractMesh
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.model.fused_score import Drawn, Scenes, fused_gain
+from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+
+COUNT, SIZE = 5, 20
+NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.1, 0.4]))
+
+
+@pytest.fixture(scope="module")
+def image():
+    x, y = (a.astype(np.float32) for a in np.moveaxis(Intrinsics(25, 25, 9.5, 9.5, SIZE, SIZE).rays()[..., :2], -1, 0))
+    return Image(
+        depth=jnp.ones((SIZE, SIZE)),
+        kind=jnp.full((SIZE, SIZE), IN_WORKSPACE),
+        ray_x=x[0],
+        ray_y=y[:, 0],
+        focal=jnp.full(2, 25.0),
+        centre=jnp.full(2, 9.5),
+        table=jnp.full((SIZE, SIZE), jnp.inf),
+        outlier_scale=jnp.float32(0.1),
+        front_margin=jnp.float32(0.01),
+    )
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")  # docs/speed.md
+@pytest.mark.parametrize("over_scenes", [False, True])
+def test_it_is_lowered_for_a_gpu(over_scenes, image, arrays):
+    T = jnp.tile(jnp.eye(4), (COUNT, 2, 1, 1)).at[:, :, 2, 3].set(0.5)
+    drawn = Drawn(jnp.zeros((COUNT, 2), jnp.int32), T, jnp.zeros((COUNT, 4)))
+    scenes = Scenes(jnp.ones((3, SIZE + 12, SIZE + 12)), jnp.zeros(COUNT, jnp.int32)) if over_scenes else None
+    gain = jax.jit(fused_gain, static_argnames=("window", "interpret"))
+    with jax.sharding.use_abstract_mesh(
+        AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", None, "gpu"))
+    ):
+        traced = gain.trace(drawn, scenes, image, arrays, NOISE, window=5, interpret=False)
+        lowered = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert "__gpu$xla.gpu.triton" in lowered and "fused_gain" in lowered
+    assert f"tensor<{COUNT * 2 * 4}xf32>" in lowered  # three of p_outlier are padded to four
