@@ -36,7 +36,8 @@ _BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by r
 _ROUND_SHARE = 0.1  # of the hypotheses, each round
 _STARTS = 2  # of alignment
 _LEAST_OUTLIERS = 0.02  # p_outlier while searching: with less, one bad pixel decides
-_REACH = (0.03, 0.02, 0.01, 0.005, 0.003, 0.003)  # metres: residuals beyond count little, step by step
+_REACH = (0.03, 0.015, 0.006, 0.003, 0.0015, 0.0008)  # metres: residuals beyond count little, step by step,
+_LEAST_REACH = (4.0, 0.003)  # but none so small, in sigmas and at most in metres
 _DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
 _RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
 _KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
@@ -311,7 +312,8 @@ def _aligned(
         square = information(slope * scale[:, None, None], weight) + 0.01 * jnp.eye(6)
         return mean + scale * jnp.linalg.solve(square, scale * pull), None
 
-    mean, _ = jax.lax.scan(one, start, jnp.array(_REACH))
+    least = jnp.minimum(_LEAST_REACH[0] * sigma, _LEAST_REACH[1])
+    mean, _ = jax.lax.scan(one, start, jnp.maximum(jnp.array(_REACH), least))
     _, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
     # With ones on the diagonal: metres and radians, and a prior a thousand times wider, are too much for float32.
     precision = information(slope, jnp.where(seen, 1 / sigma**2, 0.0)) + jnp.diag(1 / scale**2)
