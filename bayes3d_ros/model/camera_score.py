@@ -13,9 +13,7 @@ from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
-from bayes3d_ros.model.tiling import LARGE, SMALL, tiles_of_objects
-
-_SMALL = 64  # pixels across: outlines in smaller images leave large tiles half empty
+from bayes3d_ros.model.tiling import tile_size, tiles_of_objects
 
 
 class World(NamedTuple):
@@ -51,7 +49,7 @@ def log_likelihood_of_cameras(
     if in_one_kernel(image):
         return _in_one_kernel(T_camera_world, world, image, library, noise, window)
     half = window // 2
-    size = SMALL if image.depth.shape[1] <= _SMALL else LARGE
+    size = tile_size(image.depth.shape[1])
     count, objects = len(T_camera_world), len(world.type)
     T = product(T_camera_world[:, None], world.T_world_object)
     kinds = jnp.broadcast_to(world.type, (count, objects))

@@ -23,7 +23,13 @@ class TileSize(NamedTuple):
     chunk: int = 128
 
 
-LARGE, SMALL = TileSize(), TileSize(4, 256)
+LARGE, _SMALL = TileSize(), TileSize(4, 256)
+_SMALL_WIDTH = 64  # pixels across: outlines in images up to here leave large tiles half empty
+
+
+def tile_size(width: int) -> TileSize:
+    """For images of a width: the smaller tiles where the larger would be half empty."""
+    return _SMALL if width <= _SMALL_WIDTH else LARGE
 
 
 class Tiles(NamedTuple):

@@ -1,0 +1,87 @@
+"""How long a frame takes through a real node: from the image's arrival to its poses', over DDS."""
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import rclpy
+from geometry_msgs.msg import PoseArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+
+from bayes3d_ros.bags import read_frames
+from bayes3d_ros.evaluation.benchmark import TEN_TYPES, Case, line, parsing_row, ycb_library
+from bayes3d_ros.evaluation.speed_rows import SpeedRow
+from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.processes import NodeProcess, free_domain
+from bayes3d_ros.ros.received import stamp_of
+
+__all__ = ["HEADER", "count", "line", "node_row", "rows"]
+
+HEADER = "a scene_parser process: from the image's arrival to its poses'"
+RATE = 0.03  # of the recorded speed: a frame every three seconds, none waits for another
+START_SECONDS = 600.0
+
+
+class LatencyError(Exception):
+    """Why nothing was measured, in one line."""
+
+
+def count() -> int:
+    """How many rows `rows` yields."""
+    return 2
+
+
+def rows() -> Iterator[SpeedRow]:
+    """The node on the bundled bags of one and of three objects, with a library of ten types."""
+    with tempfile.TemporaryDirectory(prefix="bayes3d-latency-") as folder:
+        library = ycb_library(TEN_TYPES, Path(folder) / "library")
+        for bag in ("one_object", "three_objects"):
+            yield node_row(Case(share_directory() / "bags" / bag, TEN_TYPES), library, Path(folder))
+
+
+def node_row(case: Case, library: Path, logs: Path, rate: float = RATE) -> SpeedRow:
+    """Seconds of every frame of a bag that bag_player plays slowly. Raises LatencyError where poses do not come."""
+    reader = read_frames(case.bag)
+    frames = list(reader)
+    camera, stamps = frames[0].intrinsics, [frame.stamp_ns for frame in frames]
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    domain, context = free_domain(), rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    processes: list[NodeProcess] = []
+    came: dict[str, dict[int, float]] = {"image": {}, "poses": {}}
+    most_objects = 0
+
+    def keep(what: str, message: Image | PoseArray) -> None:
+        nonlocal most_objects
+        came[what].setdefault(stamp_of(message), time.perf_counter())
+        if isinstance(message, PoseArray):
+            most_objects = max(most_objects, len(message.poses))
+
+    try:
+        node = Node("latency", context=context)
+        node.create_subscription(Image, reader.depth_topic, lambda m: keep("image", m), 10)
+        node.create_subscription(PoseArray, "/scene_parser/poses", lambda m: keep("poses", m), 10)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        size = ("-p", f"warm_up_width:={camera.width}", "-p", f"warm_up_height:={camera.height}")
+        parser = ["-m", "bayes3d_ros.ros.scene_parser", "--ros-args", "-p", f"library:={library}", *size]
+        processes.append(NodeProcess(parser, domain, logs / "scene_parser.log"))
+        player = ["-m", "bayes3d_ros.ros.bag_player", str(case.bag), "--rate", str(rate), "--wait", str(START_SECONDS)]
+        processes.append(NodeProcess(player, domain, logs / "bag_player.log"))
+        deadline = time.monotonic() + START_SECONDS
+        while not came["poses"].keys() >= set(stamps):
+            executor.spin_once(timeout_sec=0.1)
+            for process in processes:
+                if process.status not in (None, 0) or time.monotonic() > deadline:
+                    last = (process.output().strip().splitlines() or ["it said nothing"])[-1]
+                    raise LatencyError(f"{len(came['poses'])} of {len(stamps)} frames of {case.bag} came back: {last}")
+    finally:
+        for process in processes:
+            process.stop()
+        rclpy.try_shutdown(context=context)
+    seconds = [came["poses"][stamp] - came["image"][stamp] for stamp in stamps if stamp in came["image"]]
+    return parsing_row("node", case, f"{camera.width}x{camera.height}", seconds, most_objects)
