@@ -57,7 +57,7 @@ def parsers(monkeypatch, fake_posterior):
             return fake_posterior(frame, self.models.names)
 
     monkeypatch.setattr(scene_parsing, "SceneParser", Parser)
-    compilation = SimpleNamespace(enable_cache=lambda: None)
+    compilation = SimpleNamespace(enable_cache=lambda: None, every_core=lambda: None)
     monkeypatch.setitem(sys.modules, "bayes3d_ros.inference.compilation", compilation)
     return SimpleNamespace(made=made, failing=Parser.failing)
 
