@@ -1,7 +1,7 @@
 """Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outli
 from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.tiling import tile_size, tiles_of_objects
+
+if TYPE_CHECKING:
+    from bayes3d_ros.model.fused_score import Drawn
 
 
 class World(NamedTuple):
@@ -47,7 +50,9 @@ def log_likelihood_of_cameras(
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
     `image.table` is not used."""
     if in_one_kernel(image):
-        return _in_one_kernel(T_camera_world, world, image, library, noise, window)
+        from bayes3d_ros.model.fused_score import fused_gain  # Pallas takes a while to import
+
+        return fused_gain(_drawn(T_camera_world, world), None, image, library, noise, window)
     half = window // 2
     size = tile_size(image.depth.shape[1])
     count, objects = len(T_camera_world), len(world.type)
@@ -68,25 +73,18 @@ def log_likelihood_of_cameras(
     return over_depth(score, start, draw, drawn, scored, count, image, half, size)
 
 
-def _in_one_kernel(
-    T_camera_world: Float[Array, "N 4 4"],
-    world: World,
-    image: Image,
-    library: LibraryArrays,
-    noise: Noise,
-    window: int,
-) -> Float[Array, "N S P"]:
-    from bayes3d_ros.model.fused_score import Drawn, fused_gain  # Pallas takes a while to import
+def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> "Drawn":
+    """The world as every camera sees it."""
+    from bayes3d_ros.model.fused_score import Drawn
 
     normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
     plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
-    drawn = Drawn(
+    return Drawn(
         type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
         T_camera_object=product(T_camera_world[:, None], world.T_world_object),
         plane=jnp.where(world.table, plane, 0.0),
         everywhere=world.table,
     )
-    return fused_gain(drawn, None, image, library, noise, window)
 
 
 def depth_along(

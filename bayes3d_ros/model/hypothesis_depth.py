@@ -23,9 +23,10 @@ def in_one_kernel(image: Image) -> bool:
     return jax.default_backend() == "gpu" and image.likelihood.name == "depth" and image.points is None
 
 
-def padding(window: int, size: TileSize) -> tuple[int, int]:
-    """Pixels of padding before and after an image, so that every tile with its window lies inside."""
-    return window // 2, window // 2 + size.tile
+def padding(half: int, size: TileSize) -> tuple[int, int]:
+    """Pixels of padding before and after an image, so that every tile with its window, of which this is half, lies
+    inside."""
+    return half, half + size.tile
 
 
 def draw_tiles(
@@ -76,8 +77,7 @@ def over_depth(
 ):
     """carry = score(carry, hypothesis, u, v, depth, real) over the tiles to be scored of `count` hypotheses, depth with
     a border of half a window around; `drawn` are the tiles in which there may be a surface."""
-    height, width = image.depth.shape
-    shape = (height + 2 * half + size.tile, width + 2 * half + size.tile)
+    shape = tuple(side + sum(padding(half, size)) for side in image.depth.shape)
     batch = max(1, min(count, _BATCH_PIXELS // (shape[0] * shape[1])))
     side, each = size.tile + 2 * half, drawn.u.shape[0] // count
 

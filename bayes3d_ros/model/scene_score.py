@@ -17,7 +17,7 @@ from bayes3d_ros.model.tiling import LARGE, Tiles, tiles_of_objects
 
 
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
-    pad = [(0, 0)] * (depth.ndim - 2) + [padding(window, LARGE)] * 2
+    pad = [(0, 0)] * (depth.ndim - 2) + [padding(window // 2, LARGE)] * 2
     return jnp.pad(depth, pad, constant_values=jnp.inf)
 
 
