@@ -13,6 +13,7 @@ from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
+from bayes3d_ros.model.rendering.plane import plane_depth
 from bayes3d_ros.model.tiling import tile_size, tiles_of_objects
 
 if TYPE_CHECKING:
@@ -32,9 +33,7 @@ def table_depth(
 ) -> Float[Array, "*shape"]:
     """Depth of the plane z = 0 of the world along rays (x, y, 1), inf where they do not meet its upper side."""
     normal, origin = T_camera_world[..., :3, 2], T_camera_world[..., :3, 3]
-    facing = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]
-    depth = (normal * origin).sum(-1) / jnp.where(facing < -1e-3, facing, -1.0)
-    return jnp.where((facing < -1e-3) & (depth > 0), depth, jnp.inf)
+    return plane_depth([normal[..., a] for a in range(3)], (normal * origin).sum(-1), x, y)
 
 
 @partial(jax.jit, static_argnames="window")

@@ -18,13 +18,21 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, Pixels, by_kind, outlier_density, ray_mixture
-from bayes3d_ros.model.rendering.voxel_march import MOST_STEPS, NO_SURFACE, advance, depth_met, enter_grid, on_its_way
+from bayes3d_ros.model.rendering.plane import plane_depth
+from bayes3d_ros.model.rendering.voxel_march import (
+    MOST_STEPS,
+    NEAR,
+    NO_SURFACE,
+    advance,
+    depth_met,
+    enter_grid,
+    on_its_way,
+)
 from bayes3d_ros.model.tiling import LARGE, tiles_of_objects
 
 _PROGRAMS = 1024  # at a time, at most
 _BLOCK = 128  # rays, or pixels, that a program's threads look at together
 _WARPS = 4
-_NEAR = 0.05  # metres: as in `march`
 
 
 class Drawn(NamedTuple):
@@ -217,9 +225,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
         u, v = u0 - half + column, v0 - half + row
         inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < shape.height)
         x, y = (u.astype(jnp.float32) - cx) / fx, (v.astype(jnp.float32) - cy) / fy
-        facing = normal[0] * x + normal[1] * y + normal[2]
-        plane = offset / jnp.where(facing < -1e-3, facing, -1.0)
-        depth = jnp.where((facing < -1e-3) & (plane > 0), plane, NO_SURFACE)
+        depth = plane_depth(normal, offset, x, y)
         for which in range(shape.objects):
             thing = n * shape.objects + which
             kind = given.type[thing]
@@ -230,7 +236,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
                 given.size[kind],
                 [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
                 (x, y),
-                _NEAR,
+                NEAR,
             )
             walk = walk._replace(leave=jnp.where(inside, walk.leave, -NO_SURFACE))
 
@@ -240,7 +246,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
 
             def go(state: tuple[Array, Array], walk=walk) -> tuple[Array, Array]:
                 step, t = state
-                return step + 1, advance(look_up, walk, t, _NEAR)
+                return step + 1, advance(look_up, walk, t, NEAR)
 
             t = jax.lax.while_loop(unfinished, go, (jnp.int32(0), t))[1]
             depth = jnp.minimum(depth, depth_met(t))

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.model.library_arrays import OFFSET_RANGE, LibraryArrays
 
 INFLATION = 0.2  # voxels
+NEAR = 0.05  # metres: nothing is met before
 _FIRST_STEPS = 4  # of all rays alike
 # Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
 _STAGES = ((2, 4), (8, 8), (16, 96))
@@ -42,7 +43,7 @@ def march(
     type_index: Int[Array, "*objects"],
     T_camera_object: Float[Array, "*objects 4 4"],
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
-    near: float = 0.05,
+    near: float = NEAR,
 ) -> Float[Array, "*shape"]:
     """Depth z in metres along rays (x, y, 1) of an object each, NO_SURFACE where it is not met.
 
