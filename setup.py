@@ -44,6 +44,7 @@ setup(
         "matplotlib>=3.6",
         "mcap>=1.1",
         "networkx>=2.8",
+        "numba>=0.61",
         "numpy>=1.26",
         "pyyaml>=6.0",
         "rosbags>=0.10",

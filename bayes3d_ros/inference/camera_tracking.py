@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.poses import pose_matrix
@@ -19,11 +18,11 @@ from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.scene_parsing import SceneParser, frame_key
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera
+from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
-from bayes3d_ros.model.motions import exp_about, log_about, product
+from bayes3d_ros.model.motions import exp_about, inverse, log_about, product, quaternions
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.pose_statistics import rotation_mean, second_moment
@@ -69,7 +68,6 @@ class CameraTracker:
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._smooth = jax.jit(_smooth_covariance)
-        self._render = jax.jit(render_camera)
 
     def start(self, world: KnownWorld, T_world_camera: Float[np.ndarray, "4 4"]) -> Tracking:
         """A camera at rest at a pose that is roughly known. Raises TrackingError for a world without objects, or with
@@ -109,18 +107,19 @@ class CameraTracker:
         image = self._image(frame, known.world, np.asarray(expected, np.float64))
         grid = for_returns(self._grid, image.kind, image.weight)
         motion = pose_filter.Motion(
-            jnp.float32(settings.speed_change * seconds), jnp.float32(settings.turn_change * seconds)
+            np.float32(settings.speed_change * seconds), np.float32(settings.turn_change * seconds)
         )
         key = frame_key(settings.seed, frame.stamp_ns)
         particles, info = pose_filter.step(
             key, before, image, known.scene, grid, motion, settings.hypotheses, settings.window, self._devices
         )
         smooth, explained, in_sight = self._smooth(info.T_camera_world, image, known.scene, self._error)
-        T_camera_world, log_weight, info, smooth, explained, in_sight = jax.device_get(
-            (particles.T_camera_world, particles.log_weight, info, smooth, explained, in_sight)
+        turns = _turns(particles.T_camera_world)
+        T_camera_world, turns, log_weight, info, smooth, explained, in_sight = jax.device_get(
+            (particles.T_camera_world, turns, particles.log_weight, info, smooth, explained, in_sight)
         )
         poses = np.linalg.inv(T_camera_world.astype(np.float64))
-        T_world_camera, covariance = _moments(poses, log_weight)
+        T_world_camera, covariance = _moments(poses[:, :3, 3], turns, log_weight)
         # A mean over few effective particles is itself off by what they were drawn from.
         sampled = info.proposed / (info.ess * len(log_weight))
         covariance += _carried(info.T_camera_world, np.asarray(known.scene.pivot), smooth + sampled)
@@ -187,18 +186,19 @@ class CameraTracker:
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
         rays = camera.rays()
-        image = Image(
-            depth=jnp.asarray(np.where(returned, depth, 0.0), jnp.float32),
-            kind=jnp.asarray(self._kinds(points, world, T_camera_world), jnp.int32),
-            ray_x=jnp.asarray(rays[0, :, 0]),
-            ray_y=jnp.asarray(rays[:, 0, 1]),
-            focal=jnp.array([camera.fx, camera.fy], jnp.float32),
-            centre=jnp.array([camera.cx, camera.cy], jnp.float32),
-            table=jnp.full(depth.shape, jnp.inf),
-            outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
-            front_margin=jnp.float32(3 * settings.sigma_max),
-        )
-        return on_all(image, self._devices)
+        fields = {
+            "depth": np.where(returned, depth, 0.0).astype(np.float32),
+            "kind": self._kinds(points, world, T_camera_world).astype(np.int32),
+            "ray_x": rays[0, :, 0].astype(np.float32),
+            "ray_y": rays[:, 0, 1].astype(np.float32),
+            "focal": np.array([camera.fx, camera.fy], np.float32),
+            "centre": np.array([camera.cx, camera.cy], np.float32),
+            "table": np.full(depth.shape, np.inf, np.float32),
+            "outlier_scale": np.float32(3 / (settings.far**3 - settings.near**3)),
+            "front_margin": np.float32(3 * settings.sigma_max),
+            "weight": np.float32(1),
+        }
+        return Image(**on_all(fields, self._devices))
 
     def _kinds(
         self, points: Float[np.ndarray, "H W 3"], world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]
@@ -281,7 +281,8 @@ def _smooth_covariance(
     points = depth[..., None] * jnp.stack([*rays, jnp.ones_like(depth)], -1)
     inner = seen & (jnp.abs(slope[:3]).max(0) < _STEEP)
     covariance = pose_covariance(jnp.where(inner, slope, 0.0), inner, points, error)
-    alone = render_camera(T_camera_world, scene.world._replace(table=jnp.asarray(False)), scene.library, rays)
+    objects = scene.world._replace(table=jnp.asarray(False))
+    alone = render_cameras(T_camera_world[None], objects, image, scene.library)[0]
     own = jnp.isfinite(alone) & (alone < jnp.where(seen, depth, jnp.inf) + 1e-3) & (image.kind != NO_RETURN)
     near = jnp.abs(image.depth - alone) < _EXPLAINED[0] + _EXPLAINED[1] * alone
     count = own.sum()
@@ -293,12 +294,17 @@ def _smooth_covariance(
     return covariance, (own & near).sum() / jnp.maximum(count, 1), count
 
 
+@jax.jit
+def _turns(T_camera_world: Float[Array, "N 4 4"]) -> Float[Array, "N 4"]:
+    """Orientations of cameras in the world, x y z w."""
+    return quaternions(inverse(T_camera_world))
+
+
 def _moments(
-    T_world_camera: Float[np.ndarray, "N 4 4"], log_weight: Float[np.ndarray, "N"]
+    place: Float[np.ndarray, "N 3"], turn: Float[np.ndarray, "N 4"], log_weight: Float[np.ndarray, "N"]
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
-    """Mean and covariance, on the world's axes."""
-    weight = np.exp(log_weight.astype(np.float64))
-    place, turn = T_world_camera[:, :3, 3], Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat()
+    """Mean and covariance of cameras, on the world's axes; orientations are x y z w."""
+    weight, turn = np.exp(log_weight.astype(np.float64)), turn.astype(np.float64)
     middle, towards = weight @ place / weight.sum(), rotation_mean(turn, weight)
     return pose_matrix(middle, towards), second_moment(place, turn, weight, middle, towards)
 

@@ -88,6 +88,7 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
     )
 
 
+@jax.jit
 def for_returns(
     grid: NoiseGrid, kind: Int[Array, "*shape"], weight: Float[Array, ""] | np.floating | float = 1.0
 ) -> NoiseGrid:

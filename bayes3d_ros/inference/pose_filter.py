@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
@@ -52,8 +53,8 @@ _SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no propo
 class Motion(NamedTuple):
     """How a camera may move between two frames beyond keeping its velocity: scales of a t distribution."""
 
-    shift: Float[Array, ""]  # metres
-    turn: Float[Array, ""]  # radians
+    shift: Float[Array, ""] | np.floating  # metres
+    turn: Float[Array, ""] | np.floating  # radians
 
 
 class Scene(NamedTuple):
@@ -148,7 +149,9 @@ class _Chart(NamedTuple):
 
     def log_density(self, T: Float[Array, "D 4 4"]) -> Float[Array, "D"]:
         tangent = self.tangent(T)
-        z = jax.scipy.linalg.solve_triangular(self.scale, (tangent - self.mean).T, lower=True).T
+        # Solved for six columns and not for one a draw: JAX's triangular solve is slow on CPUs.
+        inverse_scale = jax.scipy.linalg.solve_triangular(self.scale, jnp.eye(6), lower=True)
+        z = jnp.einsum("da,ba->db", tangent - self.mean, inverse_scale, precision=jax.lax.Precision.HIGHEST)
         return _log_t((z**2).sum(-1)) - jnp.log(jnp.diag(self.scale)).sum() - log_volume(tangent)
 
 
@@ -327,12 +330,9 @@ def rendered_slopes(
 ) -> tuple[Float[Array, "H W"], Float[Array, "6 H W"], Bool[Array, "H W"]]:
     """Rendered depth at a tangent that `pose` makes a camera pose of, its slopes along the tangent, and where there
     are both and a return; zero elsewhere."""
-    height, width = image.depth.shape
-    shape = (_RENDERED, height, width)
-    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
     delta = jnp.array(_DELTA)
     around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
-    depth = render_cameras(pose(at + around), scene.world, scene.library, rays)
+    depth = render_cameras(pose(at + around), scene.world, image, scene.library)
     seen = (image.kind == IN_WORKSPACE) & jnp.isfinite(depth).all(0)
     depth = jnp.where(seen, depth, 0.0)
     return depth[0], (depth[1:7] - depth[7:]) / (2 * delta[:, None, None]), seen

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
@@ -304,5 +304,12 @@ class SceneParser:
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:
     """A frame's random numbers depend on the seed and its own stamp: seconds, then nanoseconds."""
-    key = jax.random.key(seed)
-    return jax.random.fold_in(jax.random.fold_in(key, stamp_ns // 10**9 % 2**32), stamp_ns % 10**9)
+    return _folded(jax.random.key(seed), np.uint32(stamp_ns // 10**9 % 2**32), np.uint32(stamp_ns % 10**9))
+
+
+@jax.jit
+def _folded(key: PRNGKeyArray, *numbers: Int[Array, ""]) -> PRNGKeyArray:
+    """The key, with numbers folded in one by one: in one call, not in one each."""
+    for number in numbers:
+        key = jax.random.fold_in(key, number)
+    return key

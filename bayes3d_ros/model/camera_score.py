@@ -1,23 +1,22 @@
 """Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.model.hypothesis_depth import in_one_kernel, over_depth
+from bayes3d_ros.model.hypothesis_depth import over_depth
 from bayes3d_ros.model.image import Image, observed
+from bayes3d_ros.model.kernels.choice import depth_kernel, kernel
+from bayes3d_ros.model.kernels.drawn import Drawn
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.model.motions import product
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.rendering.plane import plane_depth
 from bayes3d_ros.model.tiling import tile_size, tiles_of_objects
-
-if TYPE_CHECKING:
-    from bayes3d_ros.model.fused_score import Drawn
 
 
 class World(NamedTuple):
@@ -48,10 +47,8 @@ def log_likelihood_of_cameras(
     """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
     `image.table` is not used."""
-    if in_one_kernel(image):
-        from bayes3d_ros.model.fused_score import fused_gain  # Pallas takes a while to import
-
-        return fused_gain(_drawn(T_camera_world, world), None, image, library, noise, window)
+    if gain := kernel(image):
+        return gain(_drawn(T_camera_world, world), None, image, library, noise, window)
     half = window // 2
     size = tile_size(image.depth.shape[1])
     count, objects = len(T_camera_world), len(world.type)
@@ -72,10 +69,8 @@ def log_likelihood_of_cameras(
     return over_depth(score, start, draw, drawn, scored, count, image, half, size)
 
 
-def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> "Drawn":
+def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> Drawn:
     """The world as every camera sees it."""
-    from bayes3d_ros.model.fused_score import Drawn
-
     normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
     plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
     return Drawn(
@@ -102,12 +97,13 @@ def depth_along(
 
 
 def render_cameras(
-    T_camera_world: Float[Array, "N 4 4"],
-    world: World,
-    library: LibraryArrays,
-    rays: tuple[Float[Array, "N H W"], Float[Array, "N H W"]],
+    T_camera_world: Float[Array, "N 4 4"], world: World, image: Image, library: LibraryArrays
 ) -> Float[Array, "N H W"]:
-    """What each camera sees along its rays."""
+    """What each camera sees in the pixels of an image."""
+    if depth := depth_kernel():
+        return depth(_drawn(T_camera_world, world), None, image, library)
+    shape = (len(T_camera_world), *image.depth.shape)
+    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
     return depth_along(T_camera_world[:, None, None], world, library, rays)
 
 

@@ -2,7 +2,7 @@
 
 Windows overlap: a tile's neighbours belong to the windows of its pixels too. So each hypothesis is drawn once, into an
 image of its own, and scored from there. The images of a batch fit into a cache, those of all would not fit anywhere.
-This is for CPUs, and the reference for `fused_score.py`, which does it on a GPU.
+For what `kernels/` does not do: free points, and backends other than CPUs and GPUs.
 """
 
 from collections.abc import Callable
@@ -15,12 +15,6 @@ from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.tiling import Tiles, TileSize, over_tiles
 
 _BATCH_PIXELS = 1 << 20  # of the images that are drawn at a time
-
-
-def in_one_kernel(image: Image) -> bool:
-    """Whether hypotheses of this image are drawn and scored by `fused_score.py`: on a GPU, by the density of depth
-    images."""
-    return jax.default_backend() == "gpu" and image.likelihood.name == "depth" and image.points is None
 
 
 def padding(half: int, size: TileSize) -> tuple[int, int]:

@@ -34,6 +34,11 @@ def rigid(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
     return jaxlie.SE3.from_matrix(T).normalize().as_matrix()
 
 
+def quaternions(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4"]:
+    """x y z w of the rotations."""
+    return jnp.roll(jaxlie.SE3.from_matrix(T).rotation().wxyz, -1, -1)
+
+
 def log_volume(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n"]:
     """log of the invariant measure per Lebesgue measure of the tangent: 2 log(2 (1 - cos a) / a^2), a the angle."""
     square = (tangent[..., 3:] ** 2).sum(-1)

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.model.hypothesis_depth import crop, draw_tiles, in_one_kernel, over_depth, padding
+from bayes3d_ros.model.hypothesis_depth import crop, draw_tiles, over_depth, padding
 from bayes3d_ros.model.image import Image, observed
+from bayes3d_ros.model.kernels.choice import depth_kernel, kernel
+from bayes3d_ros.model.kernels.drawn import Drawn, Scenes
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import Noise, Pixels, log_likelihood
 from bayes3d_ros.model.rendering import renderers
@@ -19,6 +21,12 @@ from bayes3d_ros.model.tiling import LARGE, Tiles, tiles_of_objects
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
     pad = [(0, 0)] * (depth.ndim - 2) + [padding(window // 2, LARGE)] * 2
     return jnp.pad(depth, pad, constant_values=jnp.inf)
+
+
+def _drawn(contact: Contact, library: LibraryArrays, table: Table) -> Drawn:
+    """An object each."""
+    T = T_camera_object(contact, library, table)
+    return Drawn(contact.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
 
 
 def _drawing(contact: Contact, image: Image, library: LibraryArrays, table: Table) -> tuple[Callable, Callable]:
@@ -61,12 +69,9 @@ def log_likelihood_gain(
 
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
-    if in_one_kernel(image):
-        from bayes3d_ros.model.fused_score import Drawn, Scenes, fused_gain  # Pallas takes a while to import
-
-        T = T_camera_object(contact, library, table)[:, None]
-        drawn = Drawn(contact.type[:, None], T, plane=jnp.zeros((len(T), 4)))
-        return fused_gain(drawn, Scenes(scenes, ancestor), image, library, noise, window)
+    if gain_of := kernel(image):
+        drawn = _drawn(contact, library, table)
+        return gain_of(drawn, Scenes(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
     draw, tiles = _drawing(contact, image, library, table)
 
@@ -93,6 +98,8 @@ def draw_objects(
     window: int,
 ) -> Float[Array, "N Hp Wp"]:
     """Scene n with object n rendered into it."""
+    if depth := depth_kernel():
+        return depth(_drawn(contact, library, table), scenes, image, library, window // 2)
     draw, tiles = _drawing(contact, image, library, table)
     drawn = tiles(0)
     each = drawn.u.shape[0] // len(scenes)

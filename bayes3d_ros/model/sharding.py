@@ -2,15 +2,13 @@
 devices where JAX is told so (`jax_num_cpu_devices`): a loop over tiles runs on one core only."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
-
-Tree = TypeVar("Tree")
 
 
 def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Callable[..., Any]:
@@ -39,9 +37,10 @@ def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Ca
     return sharded
 
 
-def on_all(arrays: Tree, devices: Sequence[jax.Device]) -> Tree:
-    """Copies on every device, as results of `over_devices` are: what goes in as it comes out is compiled once."""
-    return arrays if len(devices) <= 1 else jax.device_put(arrays, NamedSharding(_mesh(devices), PartitionSpec()))
+def on_all(arrays: Any, devices: Sequence[jax.Device]) -> Any:
+    """The same tree of arrays on every device, as results of `over_devices` are: what goes in as it comes out is
+    compiled once."""
+    return jax.device_put(arrays, NamedSharding(_mesh(devices), PartitionSpec()) if len(devices) > 1 else None)
 
 
 def _mesh(devices: Sequence[jax.Device]) -> Mesh:

@@ -9,6 +9,8 @@ import pytest
 from bayes3d_ros.model import camera_score
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera, table_depth
 from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.kernels.compiled_gain import compiled_gain
+from bayes3d_ros.model.kernels.triton_gain import triton_gain
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.model.scene_score import log_likelihood_scene, pad_scene
 
@@ -76,17 +78,21 @@ def rays():
     return tuple(jnp.float32(np.broadcast_to(a, (HEIGHT, WIDTH))) for a in (x, y[:, None]))
 
 
-def in_one_kernel(*arguments):
-    """The GPU's kernel, interpreted."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(camera_score, "in_one_kernel", lambda image: True)
-        return jax.jit(log_likelihood_of_cameras.__wrapped__, static_argnames="window")(*arguments)
+def scored_by(kernel):
+    """By a kernel whatever the backend, or by tiles; the GPU's kernel is interpreted."""
+
+    def scored(*arguments):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(camera_score, "kernel", lambda image: kernel)
+            return jax.jit(log_likelihood_of_cameras.__wrapped__, static_argnames="window")(*arguments)
+
+    return scored
 
 
-@pytest.mark.parametrize("scored", [score, in_one_kernel])
+@pytest.mark.parametrize("kernel", [compiled_gain, triton_gain, None])
 @pytest.mark.parametrize("name", WORLDS)
-def test_scores_are_those_of_whole_images(name, scored, cameras, image, arrays):
-    told = np.asarray(scored(cameras, WORLDS[name], image, arrays, NOISE, WINDOW))
+def test_scores_are_those_of_whole_images(name, kernel, cameras, image, arrays):
+    told = np.asarray(scored_by(kernel)(cameras, WORLDS[name], image, arrays, NOISE, WINDOW))
     drawn = jnp.stack([render_camera(T, WORLDS[name], arrays, rays()) for T in cameras])
     nothing = jnp.full((1, HEIGHT, WIDTH), jnp.inf)
     scenes = pad_scene(jnp.concatenate([drawn, nothing]), WINDOW)

@@ -7,6 +7,8 @@ import pytest
 
 from bayes3d_ros.model import scene_score
 from bayes3d_ros.model.image import FreePoints, Image, halved
+from bayes3d_ros.model.kernels.compiled_gain import compiled_gain
+from bayes3d_ros.model.kernels.triton_gain import triton_gain
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, T_camera_object, Table
@@ -103,20 +105,20 @@ def test_objects_are_in_the_image_partly_outside_and_behind(drawn, at_the_rim):
     assert (covered[44:47] == 0).all()
 
 
-def gain_in_one_kernel(*arguments):
-    """The GPU's kernel, interpreted."""
+def gain_by(kernel, *arguments):
+    """By a kernel whatever the backend, or by tiles; the GPU's kernel is interpreted."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_score, "in_one_kernel", lambda image: True)
+        patch.setattr(scene_score, "kernel", lambda image: kernel)
         return jax.jit(log_likelihood_gain.__wrapped__, static_argnames="window")(*arguments)
 
 
-@pytest.fixture(scope="module", params=["tiles", "one kernel"])
+@pytest.fixture(scope="module", params=[compiled_gain, triton_gain, None])
 def gains(request, contacts, drawn, ancestors, image, arrays, table):
     """Gains of the contacts, each over one of the ancestors, by either way; and from whole images."""
     ancestor = np.arange(len(drawn)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
-    gain_by = gain_of if request.param == "tiles" else gain_in_one_kernel
-    gain = np.asarray(gain_by(contacts, jnp.asarray(ancestor), scenes, image, arrays, table, NOISE, WINDOW))
+    over = jnp.asarray(ancestor), scenes, image, arrays, table
+    gain = np.asarray(gain_by(request.param, contacts, *over, NOISE, WINDOW))
     after = np.minimum(ancestors[ancestor], drawn)
     after = np.asarray(whole(pad_scene(jnp.asarray(after), WINDOW), image, NOISE, WINDOW))
     before = np.asarray(whole(scenes, image, NOISE, WINDOW))[ancestor]

@@ -22,7 +22,7 @@ _FIRST_STEPS = 4  # of all rays alike
 # Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
 _STAGES = ((2, 4), (8, 8), (16, 96))
 MOST_STEPS = _FIRST_STEPS + sum(steps for _, steps in _STAGES)
-_NUDGE = 2e-3  # voxels, past a cube's face
+NUDGE = 2e-3  # voxels, past a cube's face
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
 
@@ -95,7 +95,7 @@ def depth_met(t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def _nudge(d: Sequence[Array]) -> Array:
-    return _NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
+    return NUDGE / jnp.maximum(jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1])), jnp.abs(d[2]))
 
 
 def on_its_way(t: Array, leave: Array) -> Array:

@@ -8,8 +8,9 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.fused_score import Drawn, Scenes, fused_gain
 from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.kernels.drawn import Drawn, Scenes
+from bayes3d_ros.model.kernels.triton_gain import triton_gain
 from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
 
 COUNT, SIZE = 5, 20
@@ -38,11 +39,11 @@ def test_it_is_lowered_for_a_gpu(over_scenes, image, arrays):
     T = jnp.tile(jnp.eye(4), (COUNT, 2, 1, 1)).at[:, :, 2, 3].set(0.5)
     drawn = Drawn(jnp.zeros((COUNT, 2), jnp.int32), T, jnp.zeros((COUNT, 4)))
     scenes = Scenes(jnp.ones((3, SIZE + 12, SIZE + 12)), jnp.zeros(COUNT, jnp.int32)) if over_scenes else None
-    gain = jax.jit(fused_gain, static_argnames=("window", "interpret"))
+    gain = jax.jit(triton_gain, static_argnames=("window", "interpret"))
     with jax.sharding.use_abstract_mesh(
         AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", None, "gpu"))
     ):
         traced = gain.trace(drawn, scenes, image, arrays, NOISE, window=5, interpret=False)
         lowered = traced.lower(lowering_platforms=("cuda",)).as_text()
-    assert "__gpu$xla.gpu.triton" in lowered and "fused_gain" in lowered
+    assert "__gpu$xla.gpu.triton" in lowered and "triton_gain" in lowered
     assert f"tensor<{COUNT * 2 * 4}xf32>" in lowered  # three of p_outlier are padded to four

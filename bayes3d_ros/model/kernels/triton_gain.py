@@ -1,4 +1,4 @@
-"""Hypotheses drawn and scored in one kernel (Pallas, Triton), for GPUs: what `hypothesis_depth.py` does batch by batch.
+"""Hypotheses drawn and scored in one kernel (Pallas, Triton), for GPUs.
 
 A program takes one hypothesis after the other. It walks the rays of the pixels that the hypothesis can change, puts
 their depth where the windows of its own threads find it again (a patch of a few kilobytes, which stays in the cache),
@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.kernels.drawn import Drawn, Scenes
 from bayes3d_ros.model.library_arrays import LibraryArrays
 from bayes3d_ros.model.likelihood import NO_RETURN, Noise, Pixels, by_kind, outlier_density, ray_mixture
 from bayes3d_ros.model.rendering.plane import plane_depth
@@ -33,22 +34,6 @@ from bayes3d_ros.model.tiling import LARGE, tiles_of_objects
 _PROGRAMS = 1024  # at a time, at most
 _BLOCK = 128  # rays, or pixels, that a program's threads look at together
 _WARPS = 4
-
-
-class Drawn(NamedTuple):
-    """What each of N hypotheses adds to its scene: K objects, and a plane."""
-
-    type: Int[Array, "N K"]
-    T_camera_object: Float[Array, "N K 4 4"]
-    plane: Float[Array, "N 4"]  # n and n . o in the camera, of a plane seen from the side that n points to; 0: none
-    everywhere: Bool[Array, ""] | bool = False  # whether the whole image may change, or only what the objects cover
-
-
-class Scenes(NamedTuple):
-    """What is there already: scenes with a border (`pad_scene`), and the one of each hypothesis."""
-
-    depth: Float[Array, "A Hp Wp"]
-    ancestor: Int[Array, "N"]
 
 
 class _Inputs(NamedTuple):
@@ -96,7 +81,7 @@ class _Shape(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("window", "interpret"))
-def fused_gain(
+def triton_gain(
     drawn: Drawn,
     scenes: Scenes | None,
     image: Image,
@@ -156,7 +141,7 @@ def fused_gain(
         ),
         compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
         interpret=bool(interpret),
-        name="fused_gain",
+        name="triton_gain",
     )(*inputs)
     return gain.reshape(count, shape.sigmas, columns)[:, :, : len(noise.p_outlier)]
 

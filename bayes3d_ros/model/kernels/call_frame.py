@@ -1,0 +1,83 @@
+"""XLA's foreign functions written in numba: what a compiled function finds in the call frame that XLA hands it.
+
+The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()), version 0.1 and later
+ones of version 0: structs are looked at as arrays of 64-bit words.
+"""
+
+import ctypes
+from typing import Any
+
+import jax
+import numpy as np
+from numba import carray, njit, types
+from numba.extending import intrinsic
+
+_FRAME, _EXTENSION, _ARGUMENTS, _RESULTS = 17, 1, 9, 14  # words of XLA_FFI_CallFrame, and places in it
+_BUFFER, _DATA, _RANK, _DIMS = 6, 3, 4, 5  # of XLA_FFI_Buffer
+_METADATA = 1  # the type of the extension that asks for the version
+_VERSION_AT = 24  # bytes into XLA_FFI_Metadata
+_VERSION = (0, 1)
+
+
+@intrinsic
+def _pointer(context, address):
+    def generate(context, builder, signature, arguments):
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), generate
+
+
+@njit("int64[::1](int64, int64)", cache=True)
+def _words(address, count):
+    return carray(_pointer(address), (count,), np.int64)
+
+
+@njit("boolean(int64)", cache=True)
+def answered_version(frame):
+    """Whether XLA only asks which version of its interface this is; then it has been told."""
+    extension = _words(frame, _FRAME)[_EXTENSION]
+    if extension == 0:
+        return False
+    fields = _words(extension, 4)  # size, type (32 bits), next, metadata
+    if (fields[1] & 0xFFFFFFFF) != _METADATA:
+        return False
+    version = carray(_pointer(fields[3] + _VERSION_AT), (2,), np.int32)
+    version[0], version[1] = _VERSION
+    return True
+
+
+@njit("UniTuple(int64, 2)(int64, int64, int64)", cache=True)
+def _buffer(frame, where, k):
+    """Address and number of elements of the k-th argument or result."""
+    buffer = _words(_words(_words(frame, _FRAME)[where], k + 1)[k], _BUFFER)
+    count, dims = 1, _words(buffer[_DIMS], buffer[_RANK])
+    for axis in range(buffer[_RANK]):
+        count *= dims[axis]
+    return buffer[_DATA], count
+
+
+@njit("float32[::1](int64, int64)", cache=True)
+def floats(frame, k):
+    """The k-th argument, an array of float32, flat."""
+    address, count = _buffer(frame, _ARGUMENTS, k)
+    return carray(_pointer(address), (count,), np.float32)
+
+
+@njit("int32[::1](int64, int64)", cache=True)
+def integers(frame, k):
+    """The k-th argument, an array of int32, flat."""
+    address, count = _buffer(frame, _ARGUMENTS, k)
+    return carray(_pointer(address), (count,), np.int32)
+
+
+@njit("float32[::1](int64, int64)", cache=True)
+def float_results(frame, k):
+    """The k-th result, an array of float32, flat."""
+    address, count = _buffer(frame, _RESULTS, k)
+    return carray(_pointer(address), (count,), np.float32)
+
+
+def register(name: str, compiled: Any) -> None:
+    """Make a `numba.cfunc` of int64(int64), frame to error, known to XLA on CPUs under a name."""
+    capsule = jax.ffi.pycapsule(ctypes.cast(compiled.address, ctypes.c_void_p))
+    jax.ffi.register_ffi_target(name, capsule, platform="cpu")

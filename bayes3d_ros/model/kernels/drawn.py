@@ -1,0 +1,21 @@
+"""What kernels are given: hypotheses of what is drawn into which scenes."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Drawn(NamedTuple):
+    """What each of N hypotheses adds to its scene: K objects, and a plane."""
+
+    type: Int[Array, "N K"]
+    T_camera_object: Float[Array, "N K 4 4"]
+    plane: Float[Array, "N 4"]  # n and n . o in the camera, of a plane seen from the side that n points to; 0: none
+    everywhere: Bool[Array, ""] | bool = False  # whether the plane is there: then the whole image may change
+
+
+class Scenes(NamedTuple):
+    """What is there already: scenes with a border (`pad_scene`), and the one of each hypothesis."""
+
+    depth: Float[Array, "A Hp Wp"]
+    ancestor: Int[Array, "N"]

@@ -1,0 +1,798 @@
+"""Hypotheses drawn and scored one after the other by loops that numba compiles, for CPUs.
+
+Rays of a hypothesis walk side by side (`Lanes`): every loop over lanes is plain arithmetic, of which LLVM makes vector
+instructions, and what they look up is fetched in a loop of its own. Rays that have ended make room. The walk is that
+of `rendering/voxel_march.py`, the densities are those of `likelihood.py`, written again in scalars; tests compare.
+
+All that is compiled stands in this file: numba looks no further to see whether what it has on disk is up to date.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import cfunc, njit, types
+from numba.extending import intrinsic
+
+from bayes3d_ros.model.kernels.call_frame import answered_version, float_results, floats, integers, register
+from bayes3d_ros.model.library_arrays import OFFSET_RANGE
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, LATERAL
+from bayes3d_ros.model.rendering.voxel_march import INFLATION, MOST_STEPS, NEAR, NUDGE
+
+f32, i32, u32 = np.float32, np.int32, np.uint32
+
+GAIN, DEPTH = "bayes3d_gain_of_hypotheses", "bayes3d_depth_of_hypotheses"  # to XLA
+_LANES = 256  # rays side by side: their state stays in the first-level cache
+_FRESH = 64  # that enter a grid at a time
+_WIDE = 64  # pixels whose windows are looked at side by side
+_VECTOR = 8  # loops run over multiples of it: what lies beyond the last lane is worked out and not used
+_FIRST_STEPS, _STEPS = 3, 2  # between two times that rays that have ended make room
+_NOTHING = 1e9  # metres: no surface there
+_FAR_AWAY = 1e6  # of squared distances across, metres^2
+_BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
+_ROUNDING = 0.01  # pixels that a projection may be off
+
+# NaN and inf are kept out before; sums may be taken in any order.
+_FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
+_allocates = njit(cache=True, nogil=True, error_model="numpy")
+# Where nothing is allocated references need no counting, which takes as long as a short loop.
+_whole = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+_lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
+_inlined = _lanes
+
+
+class Lanes(NamedTuple):
+    """Rays in the voxels of one grid: direction, where they are, where they leave it, their word and pixel."""
+
+    x: Float[np.ndarray, "L"]
+    y: Float[np.ndarray, "L"]
+    z: Float[np.ndarray, "L"]
+    t: Float[np.ndarray, "L"]
+    leave: Float[np.ndarray, "L"]
+    word: Int[np.ndarray, "L"]
+    pixel: Int[np.ndarray, "L"]
+
+
+class Grid(NamedTuple):
+    """A voxel grid and a camera: where its words begin, its size in voxels, the eye and the rays' turn in voxels."""
+
+    first: int
+    nx: float
+    ny: float
+    nz: float
+    eye_x: float
+    eye_y: float
+    eye_z: float
+
+
+@intrinsic
+def _bits_as_float(context, bits):
+    def generate(context, builder, signature, arguments):
+        return builder.bitcast(arguments[0], context.get_value_type(types.float32))
+
+    return types.float32(types.int32), generate
+
+
+@intrinsic
+def _float_as_bits(context, number):
+    def generate(context, builder, signature, arguments):
+        return builder.bitcast(arguments[0], context.get_value_type(types.int32))
+
+    return types.int32(types.float32), generate
+
+
+@_inlined
+def _exp(x):
+    """exp of x <= 0, to 2e-7 of it; below -87 as at -87 (1.6e-38)."""
+    x = max(x, f32(-87.0))
+    n = i32(x * f32(1.44269504) - f32(0.5))  # towards zero: the nearest whole number
+    r = (x - f32(n) * f32(0.693359375)) + f32(n) * f32(2.12194440e-4)
+    p = f32(1.0 / 720)
+    p = p * r + f32(1.0 / 120)
+    p = p * r + f32(1.0 / 24)
+    p = p * r + f32(1.0 / 6)
+    p = p * r + f32(0.5)
+    p = p * r + f32(1.0)
+    p = p * r + f32(1.0)
+    return p * _bits_as_float(i32((n + i32(127)) << i32(23)))
+
+
+@_inlined
+def _log(x):
+    """log of x > 0, to 3e-7 (absolute, or relative where it is large)."""
+    bits = _float_as_bits(x)
+    # The mantissa from sqrt(1/2) to sqrt(2): log is the odd series of s = (m - 1) / (m + 1), |s| < 0.172.
+    shifted = i32(bits - i32(0x3F3504F3))
+    exponent = i32(shifted >> i32(23))
+    m = _bits_as_float(i32(bits - i32(exponent << i32(23))))
+    s = (m - f32(1.0)) / (m + f32(1.0))
+    q = s * s
+    series = f32(2.0 / 9)
+    series = series * q + f32(2.0 / 7)
+    series = series * q + f32(2.0 / 5)
+    series = series * q + f32(2.0 / 3)
+    series = series * q + f32(2.0)
+    return f32(exponent) * f32(0.69314718) + s * series
+
+
+@_inlined
+def _cell(eye, d, at, n):
+    """The cell, as a float, that a ray is in along one axis."""
+    return f32(i32(min(max(eye + at * d, f32(0.0)), n - f32(1.0))))
+
+
+@_lanes
+def _enter(grid, turn, rays, count):
+    """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the grid."""
+    tiny, zero = f32(1e-6), f32(0.0)
+    dx, dy, dz, t, leave = rays.x, rays.y, rays.z, rays.t, rays.leave
+    for k in range(count):
+        x, y = dx[k], dy[k]
+        a = turn[0] * x + turn[3] * y + turn[6]
+        b = turn[1] * x + turn[4] * y + turn[7]
+        c = turn[2] * x + turn[5] * y + turn[8]
+        a = tiny if abs(a) < tiny else a
+        b = tiny if abs(b) < tiny else b
+        c = tiny if abs(c) < tiny else c
+        ia, ib, ic = f32(1.0) / a, f32(1.0) / b, f32(1.0) / c
+        low_a, high_a = (zero - grid.eye_x) * ia, (grid.nx - grid.eye_x) * ia
+        low_b, high_b = (zero - grid.eye_y) * ib, (grid.ny - grid.eye_y) * ib
+        low_c, high_c = (zero - grid.eye_z) * ic, (grid.nz - grid.eye_z) * ic
+        enter = max(min(low_a, high_a), max(min(low_b, high_b), min(low_c, high_c)))
+        leave[k] = min(max(low_a, high_a), min(max(low_b, high_b), max(low_c, high_c)))
+        dx[k], dy[k], dz[k] = a, b, c
+        t[k] = max(enter, f32(NEAR)) + f32(NUDGE) * min(abs(ia), min(abs(ib), abs(ic)))
+
+
+@_lanes
+def _find(grid, lanes, count):
+    """Where in the words the voxels are that rays are in."""
+    dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
+    for k in range(count):
+        at = min(max(t[k], f32(0.0)), leave[k])
+        a, b, c = (
+            _cell(grid.eye_x, dx[k], at, grid.nx),
+            _cell(grid.eye_y, dy[k], at, grid.ny),
+            _cell(grid.eye_z, dz[k], at, grid.nz),
+        )
+        word[k] = grid.first + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
+
+
+@_lanes
+def _look_up(words, lanes, count):
+    word = lanes.word
+    for k in range(count):
+        word[k] = words[u32(word[k])]
+
+
+@_lanes
+def _advance(grid, lanes, count):
+    """One step of every ray: test its voxel, and go on to where the empty cube around it ends. A ray that has met a
+    surface at depth z holds -z from then on."""
+    zero, half = f32(0.0), f32(0.5)
+    dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
+    for k in range(count):
+        a, b, c, now, end, w = dx[k], dy[k], dz[k], t[k], leave[k], word[k]
+        at = min(max(now, zero), end)
+        # The eye, from the middle of the voxel.
+        ra = grid.eye_x - _cell(grid.eye_x, a, at, grid.nx) - half
+        rb = grid.eye_y - _cell(grid.eye_y, b, at, grid.ny) - half
+        rc = grid.eye_z - _cell(grid.eye_z, c, at, grid.nz) - half
+        surface = (w & i32(-256)) != i32(0)
+        empty = f32(w & i32(255)) - half
+        reach = half if surface else empty
+        ia, ib, ic = f32(1.0) / a, f32(1.0) / b, f32(1.0) / c
+        la, lb, lc = abs(ia), abs(ib), abs(ic)
+        out = min(reach * la - ra * ia, min(reach * lb - rb * ib, reach * lc - rc * ic))
+        na, nb, nc = f32(w >> i32(24)), f32(i32(w << i32(8)) >> i32(24)), f32(i32(w << i32(16)) >> i32(24))
+        offset = f32(i32(w << i32(24)) >> i32(24)) * f32(OFFSET_RANGE)
+        facing = na * a + nb * b + nc * c
+        facing = f32(1e-6) if abs(facing) < f32(1e-6) else facing
+        meet = (offset - (na * ra + nb * rb + nc * rc)) / facing
+        far = max(abs(ra + meet * a), max(abs(rb + meet * b), abs(rc + meet * c)))
+        then = max(out, at) + f32(NUDGE) * min(la, min(lb, lc))
+        then = -meet if (surface and far <= f32(0.5 + INFLATION) and meet > f32(NEAR)) else then
+        then = -at if w == i32(0) else then
+        t[k] = then if (now >= zero and now < end) else now
+
+
+@_lanes
+def _append(rays, count, lanes, used):
+    """Those of the first rays that meet the grid, after the lanes in use."""
+    dx, dy, dz, t, leave, place = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
+    for k in range(u32(count)):
+        at, end = rays.t[k], rays.leave[k]
+        dx[used], dy[used], dz[used] = rays.x[k], rays.y[k], rays.z[k]
+        t[used], leave[used], place[used] = at, end, rays.pixel[k]
+        used += u32(at < end)
+    return used
+
+
+@_lanes
+def _make_room(lanes, count, patch):
+    """Put down what has been met, and move the rays that go on together."""
+    dx, dy, dz, t, leave, pixel = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
+    kept = u32(0)
+    for k in range(u32(count)):
+        now, end, at = t[k], leave[k], pixel[k]
+        patch[at] = min(patch[at], -now if now < f32(0.0) else f32(_NOTHING))
+        dx[kept], dy[kept], dz[kept], t[kept], leave[kept], pixel[kept] = dx[k], dy[k], dz[k], now, end, at
+        kept += u32((now >= f32(0.0)) & (now < end))
+    return kept
+
+
+@_whole
+def _walk(words, grid, lanes, count, most, patch):
+    """The rays in the first lanes until at most so many are left; depth goes into the patch where it is nearer than
+    what is there. Returns how many are left."""
+    left, steps = MOST_STEPS, _FIRST_STEPS
+    while count > most:
+        for _ in range(steps):
+            full = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+            _find(grid, lanes, full)
+            _look_up(words, lanes, full)
+            _advance(grid, lanes, full)
+        left, steps = left - steps, _STEPS
+        count = _make_room(lanes, count, patch)
+        if left <= 0:
+            return u32(0)
+    return count
+
+
+class Picture(NamedTuple):
+    """The observed image and the camera's numbers, as the kernel is given them."""
+
+    depth: Float[np.ndarray, "H*W"]
+    kind: Int[np.ndarray, "H*W"]
+    ray_x: Float[np.ndarray, "W"]
+    ray_y: Float[np.ndarray, "H"]
+    focal_x: float
+    focal_y: float
+    centre_x: float
+    centre_y: float
+    outlier_scale: float
+    front_margin: float
+
+
+class Space(NamedTuple):
+    """What one hypothesis after the other is worked out in. Images have half a window of border, and a stride."""
+
+    lanes: Lanes
+    rays: Lanes  # that are to enter
+    turn: Float[np.ndarray, "9"]
+    column_x: Float[np.ndarray, "W"]  # rays (x, y, 1) of the camera's pixels
+    row_y: Float[np.ndarray, "H"]
+    patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
+    before: Float[np.ndarray, "I"]  # of its scene
+    changed: Int[np.ndarray, "I"]
+    wider: Int[np.ndarray, "I"]  # by half a window to either side
+    seen: Int[np.ndarray, "W"]  # of a row: windows that have changed
+    close: Int[np.ndarray, "W"]  # and are to be looked at
+    listed: Int[np.ndarray, "Q"]  # pixels whose windows are looked at
+
+
+class Windows(NamedTuple):
+    """The windows of a few pixels, side by side: w of them, of K points each."""
+
+    place: Int[np.ndarray, "w"]  # in the images with a border
+    depth: Float[np.ndarray, "w"]
+    x: Float[np.ndarray, "w"]
+    y: Float[np.ndarray, "w"]
+    norm2: Float[np.ndarray, "w"]
+    outlier: Float[np.ndarray, "w"]  # its density
+    point: Float[np.ndarray, "K*w"]
+    across: Float[np.ndarray, "K*w"]  # squared distances from the ray, and along it
+    along: Float[np.ndarray, "K*w"]
+    nearest: Float[np.ndarray, "w"]
+    both: Float[np.ndarray, "w"]
+    weight: Float[np.ndarray, "w"]
+
+
+@_allocates
+def _new_lanes(count):
+    """Lanes whose rays have left."""
+    one = np.ones(count, np.float32)
+    nowhere = np.full(count, f32(-1.0))
+    zeros = np.zeros(count, np.int32)
+    return Lanes(one, one.copy(), one.copy(), np.zeros(count, np.float32), nowhere, zeros, zeros.copy())
+
+
+@_allocates
+def _new_space(height, width, border):
+    pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
+    return Space(
+        _new_lanes(_LANES + 2 * _VECTOR),
+        _new_lanes(_FRESH + _VECTOR),
+        np.empty(9, np.float32),
+        np.empty(width, np.float32),
+        np.empty(height, np.float32),
+        np.full(pixels, f32(_NOTHING)),
+        np.full(pixels, f32(_NOTHING)),
+        np.zeros(pixels, np.uint8),
+        np.zeros(pixels, np.uint8),
+        np.zeros(width + _VECTOR, np.uint8),
+        np.zeros(width + _VECTOR, np.int32),
+        np.empty(height * width + width + _VECTOR, np.int32),
+    )
+
+
+@_allocates
+def _new_windows(points):
+    def_ = np.zeros(_WIDE, np.float32)
+    return Windows(
+        np.zeros(_WIDE, np.int32),
+        def_,
+        def_.copy(),
+        def_.copy(),
+        np.ones(_WIDE, np.float32),
+        np.ones(_WIDE, np.float32),
+        np.zeros(points * _WIDE, np.float32),
+        np.zeros(points * _WIDE, np.float32),
+        np.zeros(points * _WIDE, np.float32),
+        def_.copy(),
+        def_.copy(),
+        np.ones(_WIDE, np.float32),
+    )
+
+
+@_whole
+def _outline(pose, origin, dims, size, picture):
+    """First and one past the last column and row that a grid's box may cover; nothing of a box behind the camera."""
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
+    near, far = np.inf, -np.inf
+    for corner in range(8):
+        a = origin[0] + (corner & 1) * dims[0] * size
+        b = origin[1] + ((corner >> 1) & 1) * dims[1] * size
+        c = origin[2] + ((corner >> 2) & 1) * dims[2] * size
+        x = pose[0] * a + pose[1] * b + pose[2] * c + pose[3]
+        y = pose[4] * a + pose[5] * b + pose[6] * c + pose[7]
+        z = pose[8] * a + pose[9] * b + pose[10] * c + pose[11]
+        if not (abs(x) < _FAR_AWAY and abs(y) < _FAR_AWAY and abs(z) < _FAR_AWAY):  # NaN too
+            return 0, 0, 0, 0
+        near, far = min(near, z), max(far, z)
+        u = picture.focal_x * x / max(z, f32(_BEHIND)) + picture.centre_x
+        v = picture.focal_y * y / max(z, f32(_BEHIND)) + picture.centre_y
+        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    if far < _BEHIND:
+        return 0, 0, 0, 0
+    if near < _BEHIND:
+        return 0, width, 0, height
+    left, right = np.ceil(u0 - _ROUNDING), np.floor(u1 + _ROUNDING) + 1
+    top, bottom = np.ceil(v0 - _ROUNDING), np.floor(v1 + _ROUNDING) + 1
+    if left >= width or right <= 0 or top >= height or bottom <= 0:
+        return 0, 0, 0, 0
+    return int(max(left, 0)), int(min(right, width)), int(max(top, 0)), int(min(bottom, height))
+
+
+@_inlined
+def _eye(pose, origin, axis):
+    """Where the camera is in the grid, along an axis, in metres."""
+    return -(pose[axis] * pose[3] + pose[4 + axis] * pose[7] + pose[8 + axis] * pose[11]) - origin[axis]
+
+
+@_whole
+def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, stride, border, space):
+    """The depth of an object, where it is nearer than what is in the patch."""
+    u0, u1, v0, v1 = rectangle
+    turn, lanes, rays = space.turn, space.lanes, space.rays
+    scale = f32(1.0) / size
+    for axis in range(3):
+        for k in range(3):
+            turn[3 * k + axis] = pose[4 * k + axis] * scale
+    grid = Grid(
+        i32(first),
+        f32(dims[0]),
+        f32(dims[1]),
+        f32(dims[2]),
+        _eye(pose, origin, 0) * scale,
+        _eye(pose, origin, 1) * scale,
+        _eye(pose, origin, 2) * scale,
+    )
+    used, fresh = u32(0), 0
+    for v in range(v0, v1):
+        y, pixel = space.row_y[v], (v + border) * stride + border
+        for u in range(u0, u1):
+            rays.x[fresh], rays.y[fresh], rays.pixel[fresh] = space.column_x[u], y, pixel + u
+            fresh += 1
+            if fresh == _FRESH or (u == u1 - 1 and v == v1 - 1):
+                _enter(grid, turn, rays, (fresh + _VECTOR - 1) // _VECTOR * _VECTOR)
+                if used + fresh > _LANES:
+                    used = _walk(words, grid, lanes, used, u32(_LANES - _FRESH), patch)
+                used = _append(rays, fresh, lanes, used)
+                fresh = 0
+    _walk(words, grid, lanes, used, u32(0), patch)
+
+
+@_lanes
+def _draw_plane(normal, offset, ray_x, y, patch, at):
+    """A row of the plane's depth (`rendering/plane.py`)."""
+    for k in range(len(ray_x)):
+        facing = normal[0] * ray_x[k] + normal[1] * y + normal[2]
+        towards = facing < f32(-1e-3)
+        depth = offset / (facing if towards else f32(-1.0))
+        patch[at + k] = depth if (towards and depth > f32(0.0)) else f32(_NOTHING)
+
+
+@_lanes
+def _begin_row(scenes, scene_at, count, before, patch, at):
+    for k in range(count):
+        depth = min(scenes[scene_at + k], f32(_NOTHING))
+        before[at + k] = depth
+        patch[at + k] = depth
+
+
+@_lanes
+def _mark_row(patch, before, at, count, changed, low, high):
+    """Where the hypothesis changes a row; the least and the largest depth there, and of rows before."""
+    for k in range(count):
+        depth = patch[at + k]
+        new = depth < before[at + k]
+        changed[at + k] = np.uint8(new)
+        low = min(low, depth)
+        high = max(high, depth if new else f32(0.0))
+    return low, high
+
+
+@_lanes
+def _wider_row(changed, at, border, count, wider):
+    """Pixels of a row in whose windows' own row something has changed."""
+    if border == 1:
+        for k in range(count):
+            place = at + k
+            wider[place] = changed[place - 1] | changed[place] | changed[place + 1]
+    elif border == 2:
+        for k in range(count):
+            place = at + k
+            wider[place] = (
+                changed[place - 2] | changed[place - 1] | changed[place] | changed[place + 1] | changed[place + 2]
+            )
+    else:
+        for k in range(count):
+            wider[at + k] = changed[at + k]
+        for du in range(1, border + 1):
+            for k in range(count):
+                wider[at + k] |= changed[at + k - du] | changed[at + k + du]
+
+
+@_lanes
+def _seen_row(wider, at, stride, border, count, seen):
+    """Pixels of a row whose windows have changed."""
+    if border == 1:
+        for k in range(count):
+            place = at + k
+            seen[k] = wider[place - stride] | wider[place] | wider[place + stride]
+    elif border == 2:
+        for k in range(count):
+            place = at + k
+            seen[k] = (
+                wider[place - 2 * stride]
+                | wider[place - stride]
+                | wider[place]
+                | wider[place + stride]
+                | wider[place + 2 * stride]
+            )
+    else:
+        for k in range(count):
+            seen[k] = wider[at + k]
+        for dv in range(1, border + 1):
+            for k in range(count):
+                seen[k] |= wider[at + k - dv * stride] | wider[at + k + dv * stride]
+
+
+@_lanes
+def _sort_row(picture, pixel, count, seen, patch, before, at, low, high, close):
+    """Pixels of a row that the hypothesis changes: how many have windows to be looked at (`close`), how many are too
+    far from every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
+    depth, kind = picture.depth, picture.kind
+    near, far, hidden = i32(0), i32(0), i32(0)
+    for k in range(count):
+        z, sort = depth[pixel + k], kind[pixel + k]
+        counts = i32((seen[k] != np.uint8(0)) & (sort == i32(IN_WORKSPACE)))
+        looked = counts & i32((z > low) & (z < high))
+        close[k] = looked
+        near += looked
+        far += counts - looked
+        limit = z + picture.front_margin
+        hidden += i32((sort == i32(BEYOND)) & (patch[at + k] < limit) & (before[at + k] >= limit))
+    return near, far, hidden
+
+
+@_lanes
+def _list_row(close, count, pixel, listed, used):
+    for k in range(u32(count)):
+        listed[used] = i32(pixel) + i32(k)
+        used += u32(close[k])
+    return used
+
+
+@_whole
+def _begin_windows(picture, listed, first, count, stride, border, windows):
+    """The windows of some pixels; beyond the last, its own again."""
+    width = u32(len(picture.ray_x))
+    for k in range((count + _VECTOR - 1) // _VECTOR * _VECTOR):
+        pixel = u32(listed[first + min(k, count - 1)])
+        v = pixel // width
+        u = pixel - v * width
+        x, y, z = picture.ray_x[u], picture.ray_y[v], picture.depth[pixel]
+        windows.place[k] = (v + border) * stride + u + border
+        windows.depth[k], windows.x[k], windows.y[k] = z, x, y
+        windows.norm2[k] = f32(1.0) + x * x + y * y
+        windows.outlier[k] = picture.outlier_scale * z * z
+
+
+@_lanes
+def _pick_points(image, offset, windows, to, full):
+    place, point = windows.place, windows.point
+    for k in range(full):
+        point[to + k] = image[place[k] + offset]
+
+
+@_lanes
+def _measure(windows, to, ex, ey, full):
+    """Squared distances of a point of every window from the ray of its middle, and along it."""
+    depth, x, y, norm2, nearest = windows.depth, windows.x, windows.y, windows.norm2, windows.nearest
+    point, across, along = windows.point, windows.across, windows.along
+    sides = ex * ex + ey * ey
+    for k in range(full):
+        d, n = point[to + k], norm2[k]
+        turned = ex * y[k] - ey * x[k]
+        apart = d * d * (sides + turned * turned) / n
+        apart = apart if d < f32(_NOTHING) else f32(_FAR_AWAY)
+        beyond = depth[k] - d * (f32(1.0) + (ex * x[k] + ey * y[k]) / n)
+        across[to + k] = apart
+        along[to + k] = n * min(beyond * beyond, f32(_FAR_AWAY))
+        nearest[k] = min(nearest[k], apart)
+
+
+@_lanes
+def _weigh(windows, to, scale, full):
+    """A point of every window into the mixtures."""
+    across, along, nearest, both, weight = (
+        windows.across,
+        windows.along,
+        windows.nearest,
+        windows.both,
+        windows.weight,
+    )
+    for k in range(full):
+        d = across[to + k]
+        w = _exp(scale * (d - nearest[k])) + (f32(LATERAL) if d < f32(_FAR_AWAY) else f32(0.0))
+        both[k] += w * _exp(scale * along[to + k])
+        weight[k] += w
+
+
+@_lanes
+def _odds(windows, norm, count, odds, to):
+    """Inliers' densities over outliers': of the mixture, 1 where a window holds no surface, and beyond the last."""
+    outlier, norm2, nearest, both, weight = (
+        windows.outlier,
+        windows.norm2,
+        windows.nearest,
+        windows.both,
+        windows.weight,
+    )
+    for k in range(_WIDE):
+        mixture = both[k] / weight[k] * np.sqrt(norm2[k]) * norm / outlier[k]
+        odds[to + k] = mixture if (nearest[k] < f32(_FAR_AWAY) and i32(k) < i32(count)) else f32(1.0)
+
+
+@_lanes
+def _fill(array, count, value):
+    for k in range(count):
+        array[k] = value
+
+
+@_whole
+def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
+    """Densities of inliers over those of outliers at every sigma, of the windows' points in an image."""
+    full = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+    step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
+    _fill(windows.nearest, full, f32(_FAR_AWAY))
+    to = 0
+    for dv in range(-border, border + 1):
+        for du in range(-border, border + 1):
+            _pick_points(image, dv * stride + du, windows, to, full)
+            _measure(windows, to, f32(du) * step_x, f32(dv) * step_y, full)
+            to += _WIDE
+    for s in range(len(sigma)):
+        _fill(windows.both, full, f32(0.0))
+        _fill(windows.weight, full, f32(0.0))
+        scale = f32(-0.5) / (sigma[s] * sigma[s])
+        for point in range((2 * border + 1) ** 2):
+            _weigh(windows, point * _WIDE, scale, full)
+        _odds(windows, f32(1.0) / (f32(2.50662827) * sigma[s]), count, odds, s * _WIDE)
+
+
+@_lanes
+def _sum_of_logs(p, odds, at):
+    """Sum over pixels of log(p + (1 - p) odds), through the logs of products of four."""
+    total, rest = f32(0.0), f32(1.0) - p
+    for k in range(_WIDE // 4):
+        product = (p + rest * odds[at + k]) * (p + rest * odds[at + k + _WIDE // 4])
+        product *= (p + rest * odds[at + k + _WIDE // 2]) * (p + rest * odds[at + k + 3 * _WIDE // 4])
+        total += _log(product)
+    return total
+
+
+@_whole
+def _gains(
+    words, first, dims, origin, size, kinds, poses, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier,
+    weight, window, everywhere, metres, share, gain, space, windows, now, former, boxes
+):  # fmt: skip
+    count, border = len(planes) // 4, window // 2
+    objects = len(kinds) // count
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    stride = width + 2 * border
+    levels = len(sigma) * len(p_outlier)
+    with_scenes = len(scenes) > 0
+    _make_rays(picture, space)
+    for n in range(count):
+        plane = planes[4 * n : 4 * n + 4]
+        flat = everywhere and _is_plane(plane)
+        u0, u1, v0, v1 = (0, width, 0, height) if flat else (width, 0, height, 0)
+        for k in range(objects):
+            thing = n * objects + k
+            kind = kinds[thing]
+            box = _outline(poses[12 * thing : 12 * thing + 12], origin[3 * kind : 3 * kind + 3],
+                           dims[3 * kind : 3 * kind + 3], size[kind], picture)  # fmt: skip
+            boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = box
+            if box[1] > box[0]:
+                u0, u1, v0, v1 = min(u0, box[0]), max(u1, box[1]), min(v0, box[2]), max(v1, box[3])
+        for level in range(levels):
+            gain[n * levels + level] = f32(0.0)
+        if u1 <= u0:
+            continue
+        # Pixels whose windows may have changed, and those in their windows.
+        left, right = max(u0 - border, 0), min(u1 + border, width)
+        top, bottom = max(v0 - border, 0), min(v1 + border, height)
+        wide = right - left + 2 * border
+        for v in range(top - border, bottom + border):
+            at = (v + border) * stride + left
+            if with_scenes:
+                scene_at = (ancestor[n] * scene_shape[0] + v + border) * scene_shape[1] + left
+                _begin_row(scenes, scene_at, wide, space.before, space.patch, at)
+            else:
+                _fill(space.patch[at : at + wide], wide, f32(_NOTHING))
+            _fill_bytes(space.changed[at : at + wide], wide)
+            if flat and 0 <= v < height:
+                _draw_plane(plane, plane[3], space.column_x, space.row_y[v], space.patch, at + border)
+        for k in range(objects):
+            if boxes[k, 1] > boxes[k, 0]:
+                thing = n * objects + k
+                kind = kinds[thing]
+                box = (boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3])
+                _draw_object(
+                    words, first[kind], dims[3 * kind : 3 * kind + 3], origin[3 * kind : 3 * kind + 3], size[kind],
+                    poses[12 * thing : 12 * thing + 12], box, space.patch, stride, border, space
+                )  # fmt: skip
+        low, high = f32(_NOTHING), f32(0.0)
+        for v in range(v0, v1):
+            at = (v + border) * stride + u0 + border
+            low, high = _mark_row(space.patch, space.before, at, u1 - u0, space.changed, low, high)
+        if with_scenes:
+            low, high = f32(0.0), f32(_NOTHING)  # TODO
+        else:
+            low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
+        for v in range(top - border, bottom + border):
+            at = (v + border) * stride + left + border
+            _wider_row(space.changed, at, border, right - left, space.wider)
+        used, far, hidden = u32(0), 0, 0
+        for v in range(top, bottom):
+            at, pixel = (v + border) * stride + left + border, v * width + left
+            _seen_row(space.wider, at, stride, border, right - left, space.seen)
+            near, more_far, more_hidden = _sort_row(
+                picture, pixel, right - left, space.seen, space.patch, space.before, at, low, high, space.close
+            )
+            far, hidden = far + more_far, hidden + more_hidden
+            if near > 0:
+                used = _list_row(space.close, right - left, pixel, space.listed, used)
+        for level in range(levels):
+            p = p_outlier[level % len(p_outlier)]
+            gain[n * levels + level] = f32(weight * (far + hidden) * np.log(p)) if far + hidden > 0 else f32(0.0)
+        for begin in range(0, used, _WIDE):
+            some = min(used - begin, _WIDE)
+            _begin_windows(picture, space.listed, begin, some, stride, border, windows)
+            _mixtures(space.patch, stride, border, picture, sigma, windows, some, now)
+            if with_scenes:
+                _mixtures(space.before, stride, border, picture, sigma, windows, some, former)
+            for level in range(levels):
+                s, k = level // len(p_outlier), level % len(p_outlier)
+                told = _sum_of_logs(p_outlier[k], now, s * _WIDE)
+                if with_scenes:
+                    told -= _sum_of_logs(p_outlier[k], former, s * _WIDE)
+                gain[n * levels + level] += weight * told
+
+
+@_whole
+def _depths(
+    words, first, dims, origin, size, kinds, poses, planes, picture, start, rows, columns, border, everywhere, depth,
+    space
+):  # fmt: skip
+    count, pixels = len(planes) // 4, rows * columns
+    objects = len(kinds) // count
+    _make_rays(picture, space)
+    for n in range(count):
+        image = depth[n * pixels : (n + 1) * pixels]
+        for k in range(pixels):
+            image[k] = min(start[n * pixels + k], f32(_NOTHING)) if len(start) > 0 else f32(_NOTHING)
+        plane = planes[4 * n : 4 * n + 4]
+        if everywhere and _is_plane(plane):
+            for v in range(len(picture.ray_y)):
+                at = (v + border) * columns + border
+                _draw_plane(plane, plane[3], space.column_x, space.row_y[v], image, at)
+        for k in range(objects):
+            thing = n * objects + k
+            kind = kinds[thing]
+            pose, low = poses[12 * thing : 12 * thing + 12], origin[3 * kind : 3 * kind + 3]
+            box = _outline(pose, low, dims[3 * kind : 3 * kind + 3], size[kind], picture)
+            if box[1] > box[0]:
+                _draw_object(words, first[kind], dims[3 * kind : 3 * kind + 3], low, size[kind], pose, box, image,
+                             columns, border, space)  # fmt: skip
+        for k in range(pixels):
+            image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
+
+
+@_whole
+def _make_rays(picture, space):
+    """The rays (x, y, 1) of the camera's columns and rows."""
+    for u in range(len(picture.ray_x)):
+        space.column_x[u] = (f32(u) - picture.centre_x) / picture.focal_x
+    for v in range(len(picture.ray_y)):
+        space.row_y[v] = (f32(v) - picture.centre_y) / picture.focal_y
+
+
+@_whole
+def _is_plane(plane):
+    return abs(plane[0] + plane[1] + plane[2] + plane[3]) < _NOTHING  # not NaN
+
+
+@_lanes
+def _fill_bytes(array, count):
+    for k in range(count):
+        array[k] = np.uint8(0)
+
+
+@cfunc(types.int64(types.int64), cache=True)
+def _gain(frame):
+    """See `compiled_gain.compiled_gain`."""
+    if answered_version(frame):
+        return 0
+    numbers, settings = floats(frame, 12), integers(frame, 17)
+    kinds, planes, sigma, window = integers(frame, 5), floats(frame, 7), floats(frame, 15), settings[0]
+    picture = Picture(
+        floats(frame, 8), integers(frame, 9), floats(frame, 10), floats(frame, 11),
+        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
+    )  # fmt: skip
+    objects = len(kinds) * 4 // max(len(planes), 1)
+    _gains(
+        integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4), kinds,
+        floats(frame, 6), planes, picture, floats(frame, 13), settings[2:4], integers(frame, 14), sigma,
+        floats(frame, 16), numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
+        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2), _new_windows(window * window),
+        np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
+        np.zeros((objects, 4), np.int64),
+    )  # fmt: skip
+    return 0
+
+
+@cfunc(types.int64(types.int64), cache=True)
+def _depth(frame):
+    """See `compiled_gain.compiled_depth`."""
+    if answered_version(frame):
+        return 0
+    numbers, shape, start = floats(frame, 10), integers(frame, 12), floats(frame, 11)
+    picture = Picture(
+        start, integers(frame, 1), floats(frame, 8), floats(frame, 9),
+        numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
+    )  # fmt: skip
+    _depths(
+        integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4),
+        integers(frame, 5), floats(frame, 6), floats(frame, 7), picture, start, shape[0], shape[1], shape[2],
+        shape[3] != 0, float_results(frame, 0), _new_space(len(picture.ray_y), len(picture.ray_x), 0),
+    )  # fmt: skip
+    return 0
+
+
+register(GAIN, _gain)
+register(DEPTH, _depth)
