@@ -19,7 +19,10 @@ from bayes3d_ros.model.library_arrays import OFFSET_RANGE
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, LATERAL
 from bayes3d_ros.model.rendering.voxel_march import INFLATION, MOST_STEPS, NEAR, NUDGE
 
-f32, i32, u32 = np.float32, np.int32, np.uint32
+f32, i32 = np.float32, np.int32
+# Places are unsigned: numba would let negative ones count from the end, and that keeps LLVM from seeing that arrays are
+# apart; loops would then run as scalars or as vectors, which round differently, as memory happens to be laid out.
+u64 = np.uint64
 
 GAIN, DEPTH = "bayes3d_gain_of_hypotheses", "bayes3d_depth_of_hypotheses"  # to XLA
 _LANES = 256  # rays side by side: their state stays in the first-level cache
@@ -126,7 +129,7 @@ def _enter(grid, turn, rays, count):
     """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the grid."""
     tiny, zero = f32(1e-6), f32(0.0)
     dx, dy, dz, t, leave = rays.x, rays.y, rays.z, rays.t, rays.leave
-    for k in range(count):
+    for k in range(u64(count)):
         x, y = dx[k], dy[k]
         a = turn[0] * x + turn[3] * y + turn[6]
         b = turn[1] * x + turn[4] * y + turn[7]
@@ -148,7 +151,7 @@ def _enter(grid, turn, rays, count):
 def _find(grid, lanes, count):
     """Where in the words the voxels are that rays are in."""
     dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
-    for k in range(count):
+    for k in range(u64(count)):
         at = min(max(t[k], f32(0.0)), leave[k])
         a, b, c = (
             _cell(grid.eye_x, dx[k], at, grid.nx),
@@ -161,8 +164,8 @@ def _find(grid, lanes, count):
 @_lanes
 def _look_up(words, lanes, count):
     word = lanes.word
-    for k in range(count):
-        word[k] = words[u32(word[k])]
+    for k in range(u64(count)):
+        word[k] = words[u64(word[k])]
 
 
 @_lanes
@@ -171,7 +174,7 @@ def _advance(grid, lanes, count):
     surface at depth z holds -z from then on."""
     zero, half = f32(0.0), f32(0.5)
     dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
-    for k in range(count):
+    for k in range(u64(count)):
         a, b, c, now, end, w = dx[k], dy[k], dz[k], t[k], leave[k], word[k]
         at = min(max(now, zero), end)
         # The eye, from the middle of the voxel.
@@ -200,25 +203,26 @@ def _advance(grid, lanes, count):
 def _append(rays, count, lanes, used):
     """Those of the first rays that meet the grid, after the lanes in use."""
     dx, dy, dz, t, leave, place = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
-    for k in range(u32(count)):
+    used = u64(used)
+    for k in range(u64(count)):
         at, end = rays.t[k], rays.leave[k]
         dx[used], dy[used], dz[used] = rays.x[k], rays.y[k], rays.z[k]
         t[used], leave[used], place[used] = at, end, rays.pixel[k]
-        used += u32(at < end)
-    return used
+        used += u64(at < end)
+    return np.int64(used)
 
 
 @_lanes
 def _make_room(lanes, count, patch):
     """Put down what has been met, and move the rays that go on together."""
     dx, dy, dz, t, leave, pixel = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
-    kept = u32(0)
-    for k in range(u32(count)):
+    kept = u64(0)
+    for k in range(u64(count)):
         now, end, at = t[k], leave[k], pixel[k]
         patch[at] = min(patch[at], -now if now < f32(0.0) else f32(_NOTHING))
         dx[kept], dy[kept], dz[kept], t[kept], leave[kept], pixel[kept] = dx[k], dy[k], dz[k], now, end, at
-        kept += u32((now >= f32(0.0)) & (now < end))
-    return kept
+        kept += u64((now >= f32(0.0)) & (now < end))
+    return np.int64(kept)
 
 
 @_whole
@@ -235,8 +239,20 @@ def _walk(words, grid, lanes, count, most, patch):
         left, steps = left - steps, _STEPS
         count = _make_room(lanes, count, patch)
         if left <= 0:
-            return u32(0)
+            return 0
     return count
+
+
+class Things(NamedTuple):
+    """A library, and the objects of all hypotheses; all arrays are flat."""
+
+    words: Int[np.ndarray, "V"]
+    first: Int[np.ndarray, "T"]
+    dims: Int[np.ndarray, "T*3"]
+    origin: Float[np.ndarray, "T*3"]
+    size: Float[np.ndarray, "T"]
+    kind: Int[np.ndarray, "N*K"]
+    pose: Float[np.ndarray, "N*K*12"]
 
 
 class Picture(NamedTuple):
@@ -255,7 +271,7 @@ class Picture(NamedTuple):
 
 
 class Space(NamedTuple):
-    """What one hypothesis after the other is worked out in. Images have half a window of border, and a stride."""
+    """What one hypothesis after the other is worked out in: a patch of the image, with half a window of border."""
 
     lanes: Lanes
     rays: Lanes  # that are to enter
@@ -264,11 +280,17 @@ class Space(NamedTuple):
     row_y: Float[np.ndarray, "H"]
     patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
     before: Float[np.ndarray, "I"]  # of its scene
-    changed: Int[np.ndarray, "I"]
-    wider: Int[np.ndarray, "I"]  # by half a window to either side
-    seen: Int[np.ndarray, "W"]  # of a row: windows that have changed
-    close: Int[np.ndarray, "W"]  # and are to be looked at
-    listed: Int[np.ndarray, "Q"]  # pixels whose windows are looked at
+    depth: Float[np.ndarray, "I"]  # observed
+    kind: Int[np.ndarray, "I"]
+    changed: Int[np.ndarray, "I"]  # pixels that the hypothesis changes
+    seen: Int[np.ndarray, "I"]  # pixels in whose windows there are such pixels
+    wider: Int[np.ndarray, "I"]  # those by rows
+    close: Int[np.ndarray, "I"]  # pixels whose windows are looked at
+    low: Float[np.ndarray, "I"]  # the least and the largest depth of surfaces in a window, and by rows
+    high: Float[np.ndarray, "I"]
+    row_low: Float[np.ndarray, "I"]
+    row_high: Float[np.ndarray, "I"]
+    listed: Int[np.ndarray, "I"]  # their places
 
 
 class Windows(NamedTuple):
@@ -300,44 +322,37 @@ def _new_lanes(count):
 @_allocates
 def _new_space(height, width, border):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
+    nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
-        _new_lanes(_LANES + 2 * _VECTOR),
-        _new_lanes(_FRESH + _VECTOR),
-        np.empty(9, np.float32),
-        np.empty(width, np.float32),
-        np.empty(height, np.float32),
-        np.full(pixels, f32(_NOTHING)),
-        np.full(pixels, f32(_NOTHING)),
-        np.zeros(pixels, np.uint8),
-        np.zeros(pixels, np.uint8),
-        np.zeros(width + _VECTOR, np.uint8),
-        np.zeros(width + _VECTOR, np.int32),
-        np.empty(height * width + width + _VECTOR, np.int32),
-    )
+        _new_lanes(_LANES + 2 * _VECTOR), _new_lanes(_FRESH + _VECTOR), np.empty(9, np.float32),
+        np.empty(width, np.float32), np.empty(height, np.float32), nothing, nothing.copy(), nothing.copy(), none,
+        flags, flags.copy(), flags.copy(), none.copy(), nothing.copy(), nothing.copy(),
+        nothing.copy(), nothing.copy(), none.copy(),
+    )  # fmt: skip
 
 
 @_allocates
 def _new_windows(points):
-    def_ = np.zeros(_WIDE, np.float32)
+    zeros = np.zeros(_WIDE, np.float32)
     return Windows(
         np.zeros(_WIDE, np.int32),
-        def_,
-        def_.copy(),
-        def_.copy(),
+        zeros,
+        zeros.copy(),
+        zeros.copy(),
         np.ones(_WIDE, np.float32),
         np.ones(_WIDE, np.float32),
         np.zeros(points * _WIDE, np.float32),
         np.zeros(points * _WIDE, np.float32),
         np.zeros(points * _WIDE, np.float32),
-        def_.copy(),
-        def_.copy(),
+        zeros.copy(),
+        zeros.copy(),
         np.ones(_WIDE, np.float32),
     )
 
 
 @_whole
 def _outline(pose, origin, dims, size, picture):
-    """First and one past the last column and row that a grid's box may cover; nothing of a box behind the camera."""
+    """First and one past the last column and row that a grid's box may cover, none where it lies behind the camera."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
     near, far = np.inf, -np.inf
@@ -372,7 +387,7 @@ def _eye(pose, origin, axis):
 
 
 @_whole
-def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, stride, border, space):
+def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, stride, shift, space):
     """The depth of an object, where it is nearer than what is in the patch."""
     u0, u1, v0, v1 = rectangle
     turn, lanes, rays = space.turn, space.lanes, space.rays
@@ -389,25 +404,26 @@ def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, strid
         _eye(pose, origin, 1) * scale,
         _eye(pose, origin, 2) * scale,
     )
-    used, fresh = u32(0), 0
+    used, fresh = 0, 0
     for v in range(v0, v1):
-        y, pixel = space.row_y[v], (v + border) * stride + border
+        y, pixel = space.row_y[v], v * stride + shift
         for u in range(u0, u1):
             rays.x[fresh], rays.y[fresh], rays.pixel[fresh] = space.column_x[u], y, pixel + u
             fresh += 1
             if fresh == _FRESH or (u == u1 - 1 and v == v1 - 1):
                 _enter(grid, turn, rays, (fresh + _VECTOR - 1) // _VECTOR * _VECTOR)
                 if used + fresh > _LANES:
-                    used = _walk(words, grid, lanes, used, u32(_LANES - _FRESH), patch)
+                    used = _walk(words, grid, lanes, used, _LANES - _FRESH, patch)
                 used = _append(rays, fresh, lanes, used)
                 fresh = 0
-    _walk(words, grid, lanes, used, u32(0), patch)
+    _walk(words, grid, lanes, used, 0, patch)
 
 
 @_lanes
 def _draw_plane(normal, offset, ray_x, y, patch, at):
     """A row of the plane's depth (`rendering/plane.py`)."""
-    for k in range(len(ray_x)):
+    at = u64(at)
+    for k in range(u64(len(ray_x))):
         facing = normal[0] * ray_x[k] + normal[1] * y + normal[2]
         towards = facing < f32(-1e-3)
         depth = offset / (facing if towards else f32(-1.0))
@@ -415,107 +431,148 @@ def _draw_plane(normal, offset, ray_x, y, patch, at):
 
 
 @_lanes
-def _begin_row(scenes, scene_at, count, before, patch, at):
-    for k in range(count):
+def _copy_scene(scenes, scene_at, count, before, patch, at):
+    """A row of what is there before; inf becomes _NOTHING."""
+    scene_at, at = u64(scene_at), u64(at)
+    for k in range(u64(count)):
         depth = min(scenes[scene_at + k], f32(_NOTHING))
         before[at + k] = depth
         patch[at + k] = depth
 
 
 @_lanes
-def _mark_row(patch, before, at, count, changed, low, high):
-    """Where the hypothesis changes a row; the least and the largest depth there, and of rows before."""
-    for k in range(count):
-        depth = patch[at + k]
-        new = depth < before[at + k]
-        changed[at + k] = np.uint8(new)
-        low = min(low, depth)
+def _copy_returns(picture, pixel, count, depth, kind, at):
+    """A row of the observed image."""
+    every_depth, every_kind = picture.depth, picture.kind
+    pixel, at = u64(pixel), u64(at)
+    for k in range(u64(count)):
+        depth[at + k] = every_depth[pixel + k]
+        kind[at + k] = every_kind[pixel + k]
+
+
+@_lanes
+def _mark(patch, before, size, changed):
+    """Where the hypothesis changes the patch; the least and the largest depth there."""
+    low, high = f32(_NOTHING), f32(0.0)
+    for k in range(u64(size)):
+        depth = patch[k]
+        new = depth < before[k]
+        changed[k] = np.uint8(new)
+        low = min(low, depth if new else f32(_NOTHING))
         high = max(high, depth if new else f32(0.0))
     return low, high
 
 
+@_whole
+def _windows_with(flags, size, stride, border, wider, seen):
+    """Pixels in whose windows there is a flag: along rows, then along columns. The border has neither flags nor pixels,
+    so that it does not matter where a row ends."""
+    first, last = border * stride + border, size - border * stride - border
+    _either(flags, border, size - border, 1, border, wider)
+    _either(wider, first, last, stride, border, seen)
+
+
 @_lanes
-def _wider_row(changed, at, border, count, wider):
-    """Pixels of a row in whose windows' own row something has changed."""
-    if border == 1:
-        for k in range(count):
-            place = at + k
-            wider[place] = changed[place - 1] | changed[place] | changed[place + 1]
+def _either(flags, first, last, step, border, found):
+    """found[k]: a flag at k or up to `border` steps to either side."""
+    first, last, step = u64(first), u64(last), u64(step)
+    if border == 0:
+        for k in range(first, last):
+            found[k] = flags[k]
+    elif border == 1:
+        for k in range(first, last):
+            found[k] = flags[k - step] | flags[k] | flags[k + step]
     elif border == 2:
-        for k in range(count):
-            place = at + k
-            wider[place] = (
-                changed[place - 2] | changed[place - 1] | changed[place] | changed[place + 1] | changed[place + 2]
+        for k in range(first, last):
+            found[k] = (
+                flags[k - u64(2) * step] | flags[k - step] | flags[k] | flags[k + step] | flags[k + u64(2) * step]
             )
     else:
-        for k in range(count):
-            wider[at + k] = changed[at + k]
-        for du in range(1, border + 1):
-            for k in range(count):
-                wider[at + k] |= changed[at + k - du] | changed[at + k + du]
+        for k in range(first, last):
+            found[k] = flags[k]
+        for apart in range(1, border + 1):
+            for k in range(first, last):
+                found[k] |= flags[k - u64(apart) * step] | flags[k + u64(apart) * step]
 
 
 @_lanes
-def _seen_row(wider, at, stride, border, count, seen):
-    """Pixels of a row whose windows have changed."""
-    if border == 1:
-        for k in range(count):
-            place = at + k
-            seen[k] = wider[place - stride] | wider[place] | wider[place + stride]
-    elif border == 2:
-        for k in range(count):
-            place = at + k
-            seen[k] = (
-                wider[place - 2 * stride]
-                | wider[place - stride]
-                | wider[place]
-                | wider[place + stride]
-                | wider[place + 2 * stride]
-            )
-    else:
-        for k in range(count):
-            seen[k] = wider[at + k]
-        for dv in range(1, border + 1):
-            for k in range(count):
-                seen[k] |= wider[at + k - dv * stride] | wider[at + k + dv * stride]
-
-
-@_lanes
-def _sort_row(picture, pixel, count, seen, patch, before, at, low, high, close):
-    """Pixels of a row that the hypothesis changes: how many have windows to be looked at (`close`), how many are too
-    far from every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
-    depth, kind = picture.depth, picture.kind
+def _sort(space, first, last, low, high, front_margin):
+    """Pixels that the hypothesis changes: how many have windows to be looked at (`close`), how many are too far from
+    every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
+    depth, kind, seen, patch, before, close = (
+        space.depth,
+        space.kind,
+        space.seen,
+        space.patch,
+        space.before,
+        space.close,
+    )
     near, far, hidden = i32(0), i32(0), i32(0)
-    for k in range(count):
-        z, sort = depth[pixel + k], kind[pixel + k]
+    for k in range(u64(first), u64(last)):
+        z, sort = depth[k], kind[k]
         counts = i32((seen[k] != np.uint8(0)) & (sort == i32(IN_WORKSPACE)))
         looked = counts & i32((z > low) & (z < high))
         close[k] = looked
         near += looked
         far += counts - looked
-        limit = z + picture.front_margin
-        hidden += i32((sort == i32(BEYOND)) & (patch[at + k] < limit) & (before[at + k] >= limit))
+        limit = z + front_margin
+        hidden += i32((sort == i32(BEYOND)) & (patch[k] < limit) & (before[k] >= limit))
     return near, far, hidden
 
 
 @_lanes
-def _list_row(close, count, pixel, listed, used):
-    for k in range(u32(count)):
-        listed[used] = i32(pixel) + i32(k)
-        used += u32(close[k])
-    return used
+def _begin_ends(patch, size, low, high):
+    """Depth of surfaces, as the least and the largest."""
+    for k in range(u64(size)):
+        depth = patch[k]
+        low[k], high[k] = depth, depth if depth < f32(_NOTHING) else f32(0.0)
+
+
+@_lanes
+def _widen_ends(low, high, first, last, step, border, least, most):
+    """The least and the largest up to `border` steps to either side."""
+    first, last, step = u64(first), u64(last), u64(step)
+    for k in range(first, last):
+        least[k], most[k] = low[k], high[k]
+    for apart in range(1, border + 1):
+        away = u64(apart) * step
+        for k in range(first, last):
+            least[k] = min(least[k], min(low[k - away], low[k + away]))
+            most[k] = max(most[k], max(high[k - away], high[k + away]))
+
+
+@_lanes
+def _sort_again(space, first, last, metres, share):
+    """Of the pixels whose windows were to be looked at, those that are not too far from every surface of their own
+    window; how many the others are."""
+    depth, close, low, high, far = space.depth, space.close, space.low, space.high, i32(0)
+    for k in range(u64(first), u64(last)):
+        z = depth[k]
+        within = (z > low[k] * (f32(1.0) - share) - metres) & (z < high[k] * (f32(1.0) + share) + metres)
+        looked = close[k] & i32(within)
+        far += close[k] - looked
+        close[k] = looked
+    return far
+
+
+@_lanes
+def _list(close, first, last, listed):
+    """The places of pixels whose windows are to be looked at."""
+    used = u64(0)
+    for k in range(u64(first), u64(last)):
+        listed[used] = i32(k)
+        used += u64(close[k])
+    return np.int64(used)
 
 
 @_whole
-def _begin_windows(picture, listed, first, count, stride, border, windows):
-    """The windows of some pixels; beyond the last, its own again."""
-    width = u32(len(picture.ray_x))
+def _begin_windows(picture, space, first, count, stride, left, top, windows):
+    """The windows of some listed pixels; beyond the last, its own again. (left, top) is the pixel at place 0."""
     for k in range((count + _VECTOR - 1) // _VECTOR * _VECTOR):
-        pixel = u32(listed[first + min(k, count - 1)])
-        v = pixel // width
-        u = pixel - v * width
-        x, y, z = picture.ray_x[u], picture.ray_y[v], picture.depth[pixel]
-        windows.place[k] = (v + border) * stride + u + border
+        place = space.listed[first + min(k, count - 1)]
+        row = place // stride
+        x, y, z = picture.ray_x[left + place - row * stride], picture.ray_y[top + row], space.depth[place]
+        windows.place[k] = place
         windows.depth[k], windows.x[k], windows.y[k] = z, x, y
         windows.norm2[k] = f32(1.0) + x * x + y * y
         windows.outlier[k] = picture.outlier_scale * z * z
@@ -524,8 +581,9 @@ def _begin_windows(picture, listed, first, count, stride, border, windows):
 @_lanes
 def _pick_points(image, offset, windows, to, full):
     place, point = windows.place, windows.point
-    for k in range(full):
-        point[to + k] = image[place[k] + offset]
+    to = u64(to)
+    for k in range(u64(full)):
+        point[to + k] = image[u64(place[k] + offset)]
 
 
 @_lanes
@@ -534,7 +592,8 @@ def _measure(windows, to, ex, ey, full):
     depth, x, y, norm2, nearest = windows.depth, windows.x, windows.y, windows.norm2, windows.nearest
     point, across, along = windows.point, windows.across, windows.along
     sides = ex * ex + ey * ey
-    for k in range(full):
+    to = u64(to)
+    for k in range(u64(full)):
         d, n = point[to + k], norm2[k]
         turned = ex * y[k] - ey * x[k]
         apart = d * d * (sides + turned * turned) / n
@@ -555,7 +614,8 @@ def _weigh(windows, to, scale, full):
         windows.both,
         windows.weight,
     )
-    for k in range(full):
+    to = u64(to)
+    for k in range(u64(full)):
         d = across[to + k]
         w = _exp(scale * (d - nearest[k])) + (f32(LATERAL) if d < f32(_FAR_AWAY) else f32(0.0))
         both[k] += w * _exp(scale * along[to + k])
@@ -572,14 +632,15 @@ def _odds(windows, norm, count, odds, to):
         windows.both,
         windows.weight,
     )
-    for k in range(_WIDE):
+    to = u64(to)
+    for k in range(u64(_WIDE)):
         mixture = both[k] / weight[k] * np.sqrt(norm2[k]) * norm / outlier[k]
-        odds[to + k] = mixture if (nearest[k] < f32(_FAR_AWAY) and i32(k) < i32(count)) else f32(1.0)
+        odds[to + k] = mixture if (nearest[k] < f32(_FAR_AWAY) and k < u64(count)) else f32(1.0)
 
 
 @_lanes
 def _fill(array, count, value):
-    for k in range(count):
+    for k in range(u64(count)):
         array[k] = value
 
 
@@ -608,91 +669,122 @@ def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
 def _sum_of_logs(p, odds, at):
     """Sum over pixels of log(p + (1 - p) odds), through the logs of products of four."""
     total, rest = f32(0.0), f32(1.0) - p
-    for k in range(_WIDE // 4):
-        product = (p + rest * odds[at + k]) * (p + rest * odds[at + k + _WIDE // 4])
-        product *= (p + rest * odds[at + k + _WIDE // 2]) * (p + rest * odds[at + k + 3 * _WIDE // 4])
+    at, quarter = u64(at), u64(_WIDE // 4)
+    for k in range(quarter):
+        product = (p + rest * odds[at + k]) * (p + rest * odds[at + k + quarter])
+        product *= (p + rest * odds[at + k + u64(2) * quarter]) * (p + rest * odds[at + k + u64(3) * quarter])
         total += _log(product)
     return total
 
 
 @_whole
+def _boxes(things, n, objects, picture, boxes):
+    """The rectangle around the outlines of a hypothesis' objects."""
+    u0, u1, v0, v1 = len(picture.ray_x), 0, len(picture.ray_y), 0
+    for k in range(objects):
+        thing = n * objects + k
+        kind = things.kind[thing]
+        box = _outline(
+            things.pose[12 * thing : 12 * thing + 12], things.origin[3 * kind : 3 * kind + 3],
+            things.dims[3 * kind : 3 * kind + 3], things.size[kind], picture,
+        )  # fmt: skip
+        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = box[0], box[1], box[2], box[3]
+        if box[1] > box[0]:
+            u0, u1, v0, v1 = min(u0, box[0]), max(u1, box[1]), min(v0, box[2]), max(v1, box[3])
+    return u0, u1, v0, v1
+
+
+@_whole
+def _draw_objects(things, n, objects, boxes, patch, stride, shift, space):
+    for k in range(objects):
+        if boxes[k, 1] > boxes[k, 0]:
+            thing = n * objects + k
+            kind = things.kind[thing]
+            box = (boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3])
+            _draw_object(
+                things.words, things.first[kind], things.dims[3 * kind : 3 * kind + 3],
+                things.origin[3 * kind : 3 * kind + 3], things.size[kind], things.pose[12 * thing : 12 * thing + 12],
+                box, patch, stride, shift, space,
+            )  # fmt: skip
+
+
+@_whole
+def _draw_planes(plane, picture, patch, stride, shift, space):
+    for v in range(len(picture.ray_y)):
+        _draw_plane(plane, plane[3], space.column_x, space.row_y[v], patch, v * stride + shift)
+
+
+@_whole
+def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
+    """What is there before, and what was observed, in a patch around a rectangle. Returns the patch' stride and size,
+    and its first column and row in the image, which may lie outside by half a window."""
+    u0, u1, v0, v1 = rectangle
+    width, height = len(picture.ray_x), len(picture.ray_y)
+    left, right, top, bottom = (
+        max(u0 - border, 0),
+        min(u1 + border, width),
+        max(v0 - border, 0),
+        min(v1 + border, height),
+    )
+    stride = right - left + 2 * border
+    size = stride * (bottom - top + 2 * border)
+    if scene_stride > 0:
+        for v in range(top, bottom + 2 * border):  # of scenes, which have a border as well
+            _copy_scene(
+                scenes, scene_at + v * scene_stride + left, stride, space.before, space.patch, (v - top) * stride
+            )
+    else:
+        _fill(space.patch, size, f32(_NOTHING))
+    _fill_whole(space.kind, size)
+    for v in range(top, bottom):
+        at = (v - top + border) * stride + border
+        _copy_returns(picture, v * width + left, right - left, space.depth, space.kind, at)
+    return stride, size, left - border, top - border
+
+
+@_whole
 def _gains(
-    words, first, dims, origin, size, kinds, poses, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier,
-    weight, window, everywhere, metres, share, gain, space, windows, now, former, boxes
+    things, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier, weight, window, everywhere, metres, share,
+    gain, space, windows, now, former, boxes
 ):  # fmt: skip
     count, border = len(planes) // 4, window // 2
-    objects = len(kinds) // count
-    height, width = len(picture.ray_y), len(picture.ray_x)
-    stride = width + 2 * border
-    levels = len(sigma) * len(p_outlier)
+    objects, levels = len(things.kind) // count, len(sigma) * len(p_outlier)
     with_scenes = len(scenes) > 0
     _make_rays(picture, space)
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
         flat = everywhere and _is_plane(plane)
-        u0, u1, v0, v1 = (0, width, 0, height) if flat else (width, 0, height, 0)
-        for k in range(objects):
-            thing = n * objects + k
-            kind = kinds[thing]
-            box = _outline(poses[12 * thing : 12 * thing + 12], origin[3 * kind : 3 * kind + 3],
-                           dims[3 * kind : 3 * kind + 3], size[kind], picture)  # fmt: skip
-            boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = box
-            if box[1] > box[0]:
-                u0, u1, v0, v1 = min(u0, box[0]), max(u1, box[1]), min(v0, box[2]), max(v1, box[3])
+        rectangle = _boxes(things, n, objects, picture, boxes)
+        if flat:
+            rectangle = (0, len(picture.ray_x), 0, len(picture.ray_y))
         for level in range(levels):
             gain[n * levels + level] = f32(0.0)
-        if u1 <= u0:
+        if rectangle[1] <= rectangle[0]:
             continue
-        # Pixels whose windows may have changed, and those in their windows.
-        left, right = max(u0 - border, 0), min(u1 + border, width)
-        top, bottom = max(v0 - border, 0), min(v1 + border, height)
-        wide = right - left + 2 * border
-        for v in range(top - border, bottom + border):
-            at = (v + border) * stride + left
-            if with_scenes:
-                scene_at = (ancestor[n] * scene_shape[0] + v + border) * scene_shape[1] + left
-                _begin_row(scenes, scene_at, wide, space.before, space.patch, at)
-            else:
-                _fill(space.patch[at : at + wide], wide, f32(_NOTHING))
-            _fill_bytes(space.changed[at : at + wide], wide)
-            if flat and 0 <= v < height:
-                _draw_plane(plane, plane[3], space.column_x, space.row_y[v], space.patch, at + border)
-        for k in range(objects):
-            if boxes[k, 1] > boxes[k, 0]:
-                thing = n * objects + k
-                kind = kinds[thing]
-                box = (boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3])
-                _draw_object(
-                    words, first[kind], dims[3 * kind : 3 * kind + 3], origin[3 * kind : 3 * kind + 3], size[kind],
-                    poses[12 * thing : 12 * thing + 12], box, space.patch, stride, border, space
-                )  # fmt: skip
-        low, high = f32(_NOTHING), f32(0.0)
-        for v in range(v0, v1):
-            at = (v + border) * stride + u0 + border
-            low, high = _mark_row(space.patch, space.before, at, u1 - u0, space.changed, low, high)
-        if with_scenes:
-            low, high = f32(0.0), f32(_NOTHING)  # TODO
-        else:
-            low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
-        for v in range(top - border, bottom + border):
-            at = (v + border) * stride + left + border
-            _wider_row(space.changed, at, border, right - left, space.wider)
-        used, far, hidden = u32(0), 0, 0
-        for v in range(top, bottom):
-            at, pixel = (v + border) * stride + left + border, v * width + left
-            _seen_row(space.wider, at, stride, border, right - left, space.seen)
-            near, more_far, more_hidden = _sort_row(
-                picture, pixel, right - left, space.seen, space.patch, space.before, at, low, high, space.close
-            )
-            far, hidden = far + more_far, hidden + more_hidden
-            if near > 0:
-                used = _list_row(space.close, right - left, pixel, space.listed, used)
+        scene_at = ancestor[n] * scene_shape[0] * scene_shape[1] if with_scenes else 0
+        stride, size, left, top = _begin(picture, scenes, scene_at, scene_shape[1], rectangle, border, space)
+        first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
+        if flat:
+            _draw_planes(plane, picture, space.patch, stride, shift, space)
+        _draw_objects(things, n, objects, boxes, space.patch, stride, shift, space)
+        low, high = _mark(space.patch, space.before, size, space.changed)
+        _windows_with(space.changed, size, stride, border, space.wider, space.seen)
+        low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
+        if with_scenes:  # what is there before has a say in every window
+            low, high = f32(0.0), f32(_NOTHING)
+        near, far, hidden = _sort(space, first, last, low, high, picture.front_margin)
+        if near > 0 and not with_scenes:
+            _begin_ends(space.patch, size, space.low, space.high)
+            _widen_ends(space.low, space.high, border, size - border, 1, border, space.row_low, space.row_high)
+            _widen_ends(space.row_low, space.row_high, first, last, stride, border, space.low, space.high)
+            far += _sort_again(space, first, last, metres, share)
         for level in range(levels):
             p = p_outlier[level % len(p_outlier)]
             gain[n * levels + level] = f32(weight * (far + hidden) * np.log(p)) if far + hidden > 0 else f32(0.0)
+        used = _list(space.close, first, last, space.listed) if near > 0 else 0
         for begin in range(0, used, _WIDE):
             some = min(used - begin, _WIDE)
-            _begin_windows(picture, space.listed, begin, some, stride, border, windows)
+            _begin_windows(picture, space, begin, some, stride, left, top, windows)
             _mixtures(space.patch, stride, border, picture, sigma, windows, some, now)
             if with_scenes:
                 _mixtures(space.before, stride, border, picture, sigma, windows, some, former)
@@ -705,12 +797,11 @@ def _gains(
 
 
 @_whole
-def _depths(
-    words, first, dims, origin, size, kinds, poses, planes, picture, start, rows, columns, border, everywhere, depth,
-    space
-):  # fmt: skip
-    count, pixels = len(planes) // 4, rows * columns
-    objects = len(kinds) // count
+def _depths(things, planes, picture, start, rows, columns, border, everywhere, depth, space, boxes):
+    """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
+    with, or none, and what each hypothesis adds."""
+    count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
+    objects = len(things.kind) // count
     _make_rays(picture, space)
     for n in range(count):
         image = depth[n * pixels : (n + 1) * pixels]
@@ -718,17 +809,9 @@ def _depths(
             image[k] = min(start[n * pixels + k], f32(_NOTHING)) if len(start) > 0 else f32(_NOTHING)
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
-            for v in range(len(picture.ray_y)):
-                at = (v + border) * columns + border
-                _draw_plane(plane, plane[3], space.column_x, space.row_y[v], image, at)
-        for k in range(objects):
-            thing = n * objects + k
-            kind = kinds[thing]
-            pose, low = poses[12 * thing : 12 * thing + 12], origin[3 * kind : 3 * kind + 3]
-            box = _outline(pose, low, dims[3 * kind : 3 * kind + 3], size[kind], picture)
-            if box[1] > box[0]:
-                _draw_object(words, first[kind], dims[3 * kind : 3 * kind + 3], low, size[kind], pose, box, image,
-                             columns, border, space)  # fmt: skip
+            _draw_planes(plane, picture, image, columns, shift, space)
+        _boxes(things, n, objects, picture, boxes)
+        _draw_objects(things, n, objects, boxes, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
@@ -749,8 +832,23 @@ def _is_plane(plane):
 
 @_lanes
 def _fill_bytes(array, count):
-    for k in range(count):
+    for k in range(u64(count)):
         array[k] = np.uint8(0)
+
+
+@_lanes
+def _fill_whole(array, count):
+    for k in range(u64(count)):
+        array[k] = i32(0)
+
+
+@_whole
+def _things(frame):
+    """The first seven arguments of both targets."""
+    return Things(
+        integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4),
+        integers(frame, 5), floats(frame, 6),
+    )  # fmt: skip
 
 
 @cfunc(types.int64(types.int64), cache=True)
@@ -758,20 +856,19 @@ def _gain(frame):
     """See `compiled_gain.compiled_gain`."""
     if answered_version(frame):
         return 0
+    things, planes, sigma = _things(frame), floats(frame, 7), floats(frame, 15)
     numbers, settings = floats(frame, 12), integers(frame, 17)
-    kinds, planes, sigma, window = integers(frame, 5), floats(frame, 7), floats(frame, 15), settings[0]
+    window = settings[0]
     picture = Picture(
         floats(frame, 8), integers(frame, 9), floats(frame, 10), floats(frame, 11),
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
-    objects = len(kinds) * 4 // max(len(planes), 1)
     _gains(
-        integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4), kinds,
-        floats(frame, 6), planes, picture, floats(frame, 13), settings[2:4], integers(frame, 14), sigma,
-        floats(frame, 16), numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
+        things, planes, picture, floats(frame, 13), settings[2:4], integers(frame, 14), sigma, floats(frame, 16),
+        numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
         _new_space(len(picture.ray_y), len(picture.ray_x), window // 2), _new_windows(window * window),
         np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
-        np.zeros((objects, 4), np.int64),
+        np.zeros((len(things.kind) * 4 // len(planes), 4), np.int64),
     )  # fmt: skip
     return 0
 
@@ -781,15 +878,16 @@ def _depth(frame):
     """See `compiled_gain.compiled_depth`."""
     if answered_version(frame):
         return 0
+    things, planes = _things(frame), floats(frame, 7)
     numbers, shape, start = floats(frame, 10), integers(frame, 12), floats(frame, 11)
     picture = Picture(
-        start, integers(frame, 1), floats(frame, 8), floats(frame, 9),
+        start, things.kind, floats(frame, 8), floats(frame, 9),
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
     _depths(
-        integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4),
-        integers(frame, 5), floats(frame, 6), floats(frame, 7), picture, start, shape[0], shape[1], shape[2],
-        shape[3] != 0, float_results(frame, 0), _new_space(len(picture.ray_y), len(picture.ray_x), 0),
+        things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
+        _new_space(len(picture.ray_y), len(picture.ray_x), 0),
+        np.zeros((len(things.kind) * 4 // len(planes), 4), np.int64),
     )  # fmt: skip
     return 0
 
