@@ -48,11 +48,13 @@ def test_ray_casters_meet_what_stands_there(work, name):
     assert kernel_speed.DISTANCE - 0.25 < hit < kernel_speed.DISTANCE + 0.15 and missed > 1e3
 
 
-def test_halves_of_the_work_do_something(work):
+def test_where_nothing_was_observed_nothing_is_scored(work):
     T = jnp.asarray(work.T_camera_object)
-    for what in ("render", "score"):
-        found = kernel_speed.OURS[what](T, work.image, work.library)
-        assert found.shape == (12,) and np.isfinite(found).all() and np.ptp(found) > 0
+    whats = ("render+score", "render")
+    both, drawn = (np.asarray(kernel_speed.OURS[what](T, work.image, work.library)) for what in whats)
+    assert both.shape == drawn.shape == (12,)
+    assert np.isfinite(both).all() and np.ptp(both) > 100
+    assert (drawn == 0).all()
 
 
 def test_rows_keep_the_contract_and_ratios_are_of_what_was_measured():

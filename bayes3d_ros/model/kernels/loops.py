@@ -41,7 +41,6 @@ _allocates = njit(cache=True, nogil=True, error_model="numpy")
 # Where nothing is allocated references need no counting, which takes as long as a short loop.
 _whole = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 _lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
-_inlined = _lanes
 
 
 class Lanes(NamedTuple):
@@ -57,7 +56,7 @@ class Lanes(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A voxel grid and a camera: where its words begin, its size in voxels, the eye and the rays' turn in voxels."""
+    """A voxel grid and a camera: where its words begin, its size, and where the eye is, in voxels."""
 
     first: int
     nx: float
@@ -84,9 +83,9 @@ def _float_as_bits(context, number):
     return types.int32(types.float32), generate
 
 
-@_inlined
+@_lanes
 def _exp(x):
-    """exp of x <= 0, to 2e-7 of it; below -87 as at -87 (1.6e-38)."""
+    """exp of x <= 0, to 1e-5 of it; below -87 as at -87 (1.6e-38)."""
     x = max(x, f32(-87.0))
     n = i32(x * f32(1.44269504) - f32(0.5))  # towards zero: the nearest whole number
     r = (x - f32(n) * f32(0.693359375)) + f32(n) * f32(2.12194440e-4)
@@ -100,7 +99,7 @@ def _exp(x):
     return p * _bits_as_float(i32((n + i32(127)) << i32(23)))
 
 
-@_inlined
+@_lanes
 def _log(x):
     """log of x > 0, to 3e-7 (absolute, or relative where it is large)."""
     bits = _float_as_bits(x)
@@ -118,7 +117,7 @@ def _log(x):
     return f32(exponent) * f32(0.69314718) + s * series
 
 
-@_inlined
+@_lanes
 def _cell(eye, d, at, n):
     """The cell, as a float, that a ray is in along one axis."""
     return f32(i32(min(max(eye + at * d, f32(0.0)), n - f32(1.0))))
@@ -380,7 +379,7 @@ def _outline(pose, origin, dims, size, picture):
     return int(max(left, 0)), int(min(right, width)), int(max(top, 0)), int(min(bottom, height))
 
 
-@_inlined
+@_lanes
 def _eye(pose, origin, axis):
     """Where the camera is in the grid, along an axis, in metres."""
     return -(pose[axis] * pose[3] + pose[4 + axis] * pose[7] + pose[8 + axis] * pose[11]) - origin[axis]
