@@ -105,13 +105,3 @@ def render_cameras(
     shape = (len(T_camera_world), *image.depth.shape)
     rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
     return depth_along(T_camera_world[:, None, None], world, library, rays)
-
-
-def render_camera(
-    T_camera_world: Float[Array, "4 4"],
-    world: World,
-    library: LibraryArrays,
-    rays: tuple[Float[Array, "H W"], Float[Array, "H W"]],
-) -> Float[Array, "H W"]:
-    """What one camera sees."""
-    return depth_along(T_camera_world, world, library, rays)

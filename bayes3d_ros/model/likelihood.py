@@ -41,7 +41,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 NO_RETURN, IN_WORKSPACE, BEYOND = 0, 1, 2  # kinds of pixels
-_FAR_AWAY = 1e6  # stands for an infinite squared distance
+FAR_AWAY = 1e6  # stands for an infinite squared distance
 _SCALE = 1e4
 LATERAL = 0.02
 
@@ -109,7 +109,7 @@ def ray_mixture(
             y = jnp.where(surface, y, 0.0)
             ex, ey = du * pixels.step_x, dv * pixels.step_y
             # |r_j x r|^2 from the difference of the rays: exact where the points nearly lie on the ray.
-            across.append(jnp.where(surface, y * y * (ex * ex + ey * ey + (ex * b - ey * a) ** 2) / norm2, _FAR_AWAY))
+            across.append(jnp.where(surface, y * y * (ex * ex + ey * ey + (ex * b - ey * a) ** 2) / norm2, FAR_AWAY))
             along.append(norm2 * (pixels.depth - y * (1 + (ex * a + ey * b) / norm2)) ** 2)
     nearest = across[0]
     for d in across[1:]:
@@ -117,10 +117,10 @@ def ray_mixture(
     scale = -0.5 / sigma**2
     both = weight = jnp.zeros(jnp.broadcast_shapes(jnp.shape(sigma), jnp.shape(norm2)))
     for d, q in zip(across, along, strict=True):
-        w = jnp.exp(scale * (d - nearest)) + jnp.where(d < _FAR_AWAY, lateral, 0.0)
+        w = jnp.exp(scale * (d - nearest)) + jnp.where(d < FAR_AWAY, lateral, 0.0)
         both += w * jnp.exp(scale * q)
         weight += w
-    return both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma), nearest < _FAR_AWAY
+    return both / weight * jnp.sqrt(norm2) / (jnp.sqrt(2 * jnp.pi) * sigma), nearest < FAR_AWAY
 
 
 def point_density(
@@ -141,7 +141,7 @@ def point_density(
             # z r - y r_j = (z - y) r + (cx, cy, 0): exact where the two rays are nearly one.
             e = z - y
             cx, cy = z * beside_x - y * du * pixels.step_x, z * beside_y - y * dv * pixels.step_y
-            apart2.append(jnp.where(surface, e * (e * norm2 + 2 * (a * cx + b * cy)) + cx * cx + cy * cy, _FAR_AWAY))
+            apart2.append(jnp.where(surface, e * (e * norm2 + 2 * (a * cx + b * cy)) + cx * cx + cy * cy, FAR_AWAY))
     per_pixel = z * z * pixels.step_x * pixels.step_y / (2 * jnp.pi) ** 1.5
     nothing = ~jnp.isfinite(rendered[half : half + height, half : half + width])
     background = jnp.where(nothing, outlier_density(pixels), 0.0)

@@ -43,8 +43,8 @@ class Tiles(NamedTuple):
 # The corners of a box that differ in one coordinate: its twelve edges.
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.float32)
 _EDGES = np.argwhere(np.triu(np.abs(_CORNERS[:, None] - _CORNERS).sum(-1) == 1)).T
-_ROUNDING = 0.01  # pixels that a projection may be off
-_BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
+ROUNDING = 0.01  # pixels that a projection may be off
+BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
 
 
 def tiles_of_objects(
@@ -65,14 +65,14 @@ def tiles_of_objects(
     points = library.origin[type_index][..., None, :] + _CORNERS * extent[..., None, :]
     points = (T[..., None, :3, :3] * points[..., None, :]).sum(-1) + T[..., None, :3, 3]
     z = points[..., 2]
-    u, v = (points[..., a] / jnp.maximum(z, _BEHIND) * image.focal[a] + image.centre[a] for a in range(2))
-    ahead = z.max(2) >= _BEHIND
-    whole = everywhere | ((z < _BEHIND).any(2) & ahead).any(1)  # reaches behind the camera: anywhere in the image
+    u, v = (points[..., a] / jnp.maximum(z, BEHIND) * image.focal[a] + image.centre[a] for a in range(2))
+    ahead = z.max(2) >= BEHIND
+    whole = everywhere | ((z < BEHIND).any(2) & ahead).any(1)  # reaches behind the camera: anywhere in the image
 
     def pixels(low, high, limit):
         """First and one past the last pixel whose window meets [low, high]."""
-        first = jnp.clip(jnp.ceil(low - _ROUNDING) - half, 0, limit).astype(jnp.int32)
-        past = jnp.clip(jnp.floor(high + _ROUNDING) + half + 1, 0, limit).astype(jnp.int32)
+        first = jnp.clip(jnp.ceil(low - ROUNDING) - half, 0, limit).astype(jnp.int32)
+        past = jnp.clip(jnp.floor(high + ROUNDING) + half + 1, 0, limit).astype(jnp.int32)
         anywhere = whole.reshape(-1, *[1] * (low.ndim - 1))
         return jnp.where(anywhere, 0, first), jnp.where(anywhere, limit, past)
 
@@ -84,7 +84,7 @@ def tiles_of_objects(
     top, bottom = pixels(*around(v.min(2), v.max(2)), height)
     row = top[:, None] + tile * jnp.arange(-(-height // tile))
     # The outline between the first and the last line of pixels that the row's windows see.
-    low, high = (a[:, None, :, None] for a in (row - half - _ROUNDING, row + tile - 1 + half + _ROUNDING))
+    low, high = (a[:, None, :, None] for a in (row - half - ROUNDING, row + tile - 1 + half + ROUNDING))
     (u0, u1), (v0, v1) = ([a[:, :, None, e] for e in _EDGES] for a in (u, v))
     slope = (u1 - u0) / jnp.where(jnp.abs(v1 - v0) < 1e-6, 1e-6, v1 - v0)
     inside = (jnp.minimum(v0, v1) <= high) & (jnp.maximum(v0, v1) >= low)

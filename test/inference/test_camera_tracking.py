@@ -17,7 +17,7 @@ from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker
 from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import KnownWorld, TrackingError
-from bayes3d_ros.model.camera_score import World, render_camera
+from bayes3d_ros.model.camera_score import World, depth_along
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.motions import exp_about
 from bayes3d_ros.model.objects import Library
@@ -26,7 +26,7 @@ from bayes3d_ros.model.posterior import ObjectEstimate
 
 CAMERA = Intrinsics(32.0, 32.0, 15.5, 11.5, 32, 24)
 SIGMA, STEP = 0.001, 33_000_000
-_render = jax.jit(render_camera)
+_render = jax.jit(depth_along)
 
 
 @pytest.fixture(scope="module")

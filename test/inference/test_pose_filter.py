@@ -12,7 +12,7 @@ from bayes3d_ros.evaluation.agreement import ratio_and_error
 from bayes3d_ros.inference import pose_filter as tracking
 from bayes3d_ros.inference.noise import for_returns, log_marginal, noise_grid
 from bayes3d_ros.model import motions
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera
+from bayes3d_ros.model.camera_score import World, depth_along, log_likelihood_of_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE
@@ -45,7 +45,7 @@ def looking(azimuth, distance=0.5):
     return T
 
 
-_render = jax.jit(render_camera)
+_render = jax.jit(depth_along)
 
 
 def image_from(T, scene, sigma, rng):

@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.model.likelihood import IN_WORKSPACE
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import Library
 
@@ -44,3 +48,24 @@ def library() -> Library:
 @pytest.fixture(scope="session")
 def arrays(library: Library) -> LibraryArrays:
     return library_arrays(library)
+
+
+@pytest.fixture(scope="package")
+def returns_everywhere():
+    """Makes an image of a camera with these depths, all of them in the workspace."""
+
+    def image(camera: Intrinsics, depth: np.ndarray) -> Image:
+        rays = camera.rays().astype(np.float32)
+        return Image(
+            depth=jnp.float32(depth),
+            kind=jnp.full(depth.shape, IN_WORKSPACE),
+            ray_x=rays[0, :, 0],
+            ray_y=rays[:, 0, 1],
+            focal=jnp.array([camera.fx, camera.fy]),
+            centre=jnp.array([camera.cx, camera.cy]),
+            table=jnp.full(depth.shape, jnp.inf),
+            outlier_scale=jnp.float32(0.1),
+            front_margin=jnp.float32(0.01),
+        )
+
+    return image

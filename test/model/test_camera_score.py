@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.model import camera_score
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_camera, table_depth
+from bayes3d_ros.model.camera_score import World, depth_along, log_likelihood_of_cameras, table_depth
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.kernels.compiled_gain import compiled_gain
 from bayes3d_ros.model.kernels.triton_gain import triton_gain
@@ -57,7 +57,7 @@ def image(arrays, cameras):
     """What the first camera sees of a world, noisy, with every kind of pixel."""
     rng = np.random.default_rng(1)
     x, y = (np.arange(WIDTH) - CENTRE[0]) / FOCAL[0], (np.arange(HEIGHT) - CENTRE[1]) / FOCAL[1]
-    seen = render_camera(cameras[0], WORLDS["on a table"], arrays, rays())
+    seen = depth_along(cameras[0], WORLDS["on a table"], arrays, rays())
     depth = np.where(np.isfinite(seen), seen, 2.0) + rng.normal(0, 0.003, seen.shape)
     kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
     return Image(
@@ -93,7 +93,7 @@ def scored_by(kernel):
 @pytest.mark.parametrize("name", WORLDS)
 def test_scores_are_those_of_whole_images(name, kernel, cameras, image, arrays):
     told = np.asarray(scored_by(kernel)(cameras, WORLDS[name], image, arrays, NOISE, WINDOW))
-    drawn = jnp.stack([render_camera(T, WORLDS[name], arrays, rays()) for T in cameras])
+    drawn = jnp.stack([depth_along(T, WORLDS[name], arrays, rays()) for T in cameras])
     nothing = jnp.full((1, HEIGHT, WIDTH), jnp.inf)
     scenes = pad_scene(jnp.concatenate([drawn, nothing]), WINDOW)
     expected = np.asarray(whole(scenes, image, NOISE, WINDOW))

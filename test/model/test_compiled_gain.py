@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.kernels import loops
 from bayes3d_ros.model.kernels.compiled_gain import compiled_depth, compiled_gain
 from bayes3d_ros.model.kernels.drawn import Drawn, Scenes
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import Noise
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_score import log_likelihood_scene, pad_scene
 
@@ -20,21 +19,9 @@ NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.01, 0.1, 0.4]))
 
 
 @pytest.fixture(scope="module")
-def image():
-    camera = Intrinsics(110, 110, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, WIDTH, HEIGHT)
-    x, y = (a.astype(np.float32) for a in np.moveaxis(camera.rays()[..., :2], -1, 0))
-    depth = 0.5 + 0.003 * np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))
-    return Image(
-        depth=jnp.float32(depth),
-        kind=jnp.full((HEIGHT, WIDTH), IN_WORKSPACE),
-        ray_x=x[0],
-        ray_y=y[:, 0],
-        focal=jnp.full(2, 110.0),
-        centre=jnp.array([WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5]),
-        table=jnp.full((HEIGHT, WIDTH), jnp.inf),
-        outlier_scale=jnp.float32(0.1),
-        front_margin=jnp.float32(0.01),
-    )
+def image(returns_everywhere):
+    camera = Intrinsics(110.0, 110.0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, WIDTH, HEIGHT)
+    return returns_everywhere(camera, 0.5 + 0.003 * np.random.default_rng(0).normal(size=(HEIGHT, WIDTH)))
 
 
 @pytest.fixture(scope="module")

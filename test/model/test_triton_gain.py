@@ -8,29 +8,17 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.kernels.drawn import Drawn, Scenes
 from bayes3d_ros.model.kernels.triton_gain import triton_gain
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import Noise
 
 COUNT, SIZE = 5, 20
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.1, 0.4]))
 
 
 @pytest.fixture(scope="module")
-def image():
-    x, y = (a.astype(np.float32) for a in np.moveaxis(Intrinsics(25, 25, 9.5, 9.5, SIZE, SIZE).rays()[..., :2], -1, 0))
-    return Image(
-        depth=jnp.ones((SIZE, SIZE)),
-        kind=jnp.full((SIZE, SIZE), IN_WORKSPACE),
-        ray_x=x[0],
-        ray_y=y[:, 0],
-        focal=jnp.full(2, 25.0),
-        centre=jnp.full(2, 9.5),
-        table=jnp.full((SIZE, SIZE), jnp.inf),
-        outlier_scale=jnp.float32(0.1),
-        front_margin=jnp.float32(0.01),
-    )
+def image(returns_everywhere):
+    return returns_everywhere(Intrinsics(25.0, 25.0, 9.5, 9.5, SIZE, SIZE), np.ones((SIZE, SIZE)))
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")  # docs/speed.md

@@ -16,8 +16,9 @@ from numba.extending import intrinsic
 
 from bayes3d_ros.model.kernels.call_frame import answered_version, float_results, floats, integers, register
 from bayes3d_ros.model.library_arrays import OFFSET_RANGE
-from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, LATERAL
+from bayes3d_ros.model.likelihood import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
 from bayes3d_ros.model.rendering.voxel_march import INFLATION, MOST_STEPS, NEAR, NUDGE
+from bayes3d_ros.model.tiling import BEHIND, ROUNDING
 
 f32, i32 = np.float32, np.int32
 # Places are unsigned: numba would let negative ones count from the end, and that keeps LLVM from seeing that arrays are
@@ -31,9 +32,6 @@ _WIDE = 64  # pixels whose windows are looked at side by side
 _VECTOR = 8  # loops run over multiples of it: what lies beyond the last lane is worked out and not used
 _FIRST_STEPS, _STEPS = 3, 2  # between two times that rays that have ended make room
 _NOTHING = 1e9  # metres: no surface there
-_FAR_AWAY = 1e6  # of squared distances across, metres^2
-_BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
-_ROUNDING = 0.01  # pixels that a projection may be off
 
 # NaN and inf are kept out before; sums may be taken in any order.
 _FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
@@ -115,6 +113,12 @@ def _log(x):
     series = series * q + f32(2.0 / 3)
     series = series * q + f32(2.0)
     return f32(exponent) * f32(0.69314718) + s * series
+
+
+@_whole
+def _whole_vectors(count):
+    """So many lanes, and those that fill the last vector."""
+    return (count + _VECTOR - 1) // _VECTOR * _VECTOR
 
 
 @_lanes
@@ -231,7 +235,7 @@ def _walk(words, grid, lanes, count, most, patch):
     left, steps = MOST_STEPS, _FIRST_STEPS
     while count > most:
         for _ in range(steps):
-            full = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+            full = _whole_vectors(count)
             _find(grid, lanes, full)
             _look_up(words, lanes, full)
             _advance(grid, lanes, full)
@@ -275,8 +279,6 @@ class Space(NamedTuple):
     lanes: Lanes
     rays: Lanes  # that are to enter
     turn: Float[np.ndarray, "9"]
-    column_x: Float[np.ndarray, "W"]  # rays (x, y, 1) of the camera's pixels
-    row_y: Float[np.ndarray, "H"]
     patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
     before: Float[np.ndarray, "I"]  # of its scene
     depth: Float[np.ndarray, "I"]  # observed
@@ -323,10 +325,9 @@ def _new_space(height, width, border):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
-        _new_lanes(_LANES + 2 * _VECTOR), _new_lanes(_FRESH + _VECTOR), np.empty(9, np.float32),
-        np.empty(width, np.float32), np.empty(height, np.float32), nothing, nothing.copy(), nothing.copy(), none,
-        flags, flags.copy(), flags.copy(), none.copy(), nothing.copy(), nothing.copy(),
-        nothing.copy(), nothing.copy(), none.copy(),
+        _new_lanes(_LANES + 2 * _VECTOR), _new_lanes(_FRESH + _VECTOR), np.empty(9, np.float32), nothing,
+        nothing.copy(), nothing.copy(), none, flags, flags.copy(), flags.copy(), none.copy(),
+        nothing.copy(), nothing.copy(), nothing.copy(), nothing.copy(), none.copy(),
     )  # fmt: skip
 
 
@@ -362,18 +363,18 @@ def _outline(pose, origin, dims, size, picture):
         x = pose[0] * a + pose[1] * b + pose[2] * c + pose[3]
         y = pose[4] * a + pose[5] * b + pose[6] * c + pose[7]
         z = pose[8] * a + pose[9] * b + pose[10] * c + pose[11]
-        if not (abs(x) < _FAR_AWAY and abs(y) < _FAR_AWAY and abs(z) < _FAR_AWAY):  # NaN too
+        if not (abs(x) < FAR_AWAY and abs(y) < FAR_AWAY and abs(z) < FAR_AWAY):  # NaN too
             return 0, 0, 0, 0
         near, far = min(near, z), max(far, z)
-        u = picture.focal_x * x / max(z, f32(_BEHIND)) + picture.centre_x
-        v = picture.focal_y * y / max(z, f32(_BEHIND)) + picture.centre_y
+        u = picture.focal_x * x / max(z, f32(BEHIND)) + picture.centre_x
+        v = picture.focal_y * y / max(z, f32(BEHIND)) + picture.centre_y
         u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-    if far < _BEHIND:
+    if far < BEHIND:
         return 0, 0, 0, 0
-    if near < _BEHIND:
+    if near < BEHIND:
         return 0, width, 0, height
-    left, right = np.ceil(u0 - _ROUNDING), np.floor(u1 + _ROUNDING) + 1
-    top, bottom = np.ceil(v0 - _ROUNDING), np.floor(v1 + _ROUNDING) + 1
+    left, right = np.ceil(u0 - ROUNDING), np.floor(u1 + ROUNDING) + 1
+    top, bottom = np.ceil(v0 - ROUNDING), np.floor(v1 + ROUNDING) + 1
     if left >= width or right <= 0 or top >= height or bottom <= 0:
         return 0, 0, 0, 0
     return int(max(left, 0)), int(min(right, width)), int(max(top, 0)), int(min(bottom, height))
@@ -386,7 +387,7 @@ def _eye(pose, origin, axis):
 
 
 @_whole
-def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, stride, shift, space):
+def _draw_object(words, first, dims, origin, size, pose, picture, rectangle, patch, stride, shift, space):
     """The depth of an object, where it is nearer than what is in the patch."""
     u0, u1, v0, v1 = rectangle
     turn, lanes, rays = space.turn, space.lanes, space.rays
@@ -405,12 +406,12 @@ def _draw_object(words, first, dims, origin, size, pose, rectangle, patch, strid
     )
     used, fresh = 0, 0
     for v in range(v0, v1):
-        y, pixel = space.row_y[v], v * stride + shift
+        y, pixel = picture.ray_y[v], v * stride + shift
         for u in range(u0, u1):
-            rays.x[fresh], rays.y[fresh], rays.pixel[fresh] = space.column_x[u], y, pixel + u
+            rays.x[fresh], rays.y[fresh], rays.pixel[fresh] = picture.ray_x[u], y, pixel + u
             fresh += 1
             if fresh == _FRESH or (u == u1 - 1 and v == v1 - 1):
-                _enter(grid, turn, rays, (fresh + _VECTOR - 1) // _VECTOR * _VECTOR)
+                _enter(grid, turn, rays, _whole_vectors(fresh))
                 if used + fresh > _LANES:
                     used = _walk(words, grid, lanes, used, _LANES - _FRESH, patch)
                 used = _append(rays, fresh, lanes, used)
@@ -567,7 +568,7 @@ def _list(close, first, last, listed):
 @_whole
 def _begin_windows(picture, space, first, count, stride, left, top, windows):
     """The windows of some listed pixels; beyond the last, its own again. (left, top) is the pixel at place 0."""
-    for k in range((count + _VECTOR - 1) // _VECTOR * _VECTOR):
+    for k in range(_whole_vectors(count)):
         place = space.listed[first + min(k, count - 1)]
         row = place // stride
         x, y, z = picture.ray_x[left + place - row * stride], picture.ray_y[top + row], space.depth[place]
@@ -596,10 +597,10 @@ def _measure(windows, to, ex, ey, full):
         d, n = point[to + k], norm2[k]
         turned = ex * y[k] - ey * x[k]
         apart = d * d * (sides + turned * turned) / n
-        apart = apart if d < f32(_NOTHING) else f32(_FAR_AWAY)
+        apart = apart if d < f32(_NOTHING) else f32(FAR_AWAY)
         beyond = depth[k] - d * (f32(1.0) + (ex * x[k] + ey * y[k]) / n)
         across[to + k] = apart
-        along[to + k] = n * min(beyond * beyond, f32(_FAR_AWAY))
+        along[to + k] = n * min(beyond * beyond, f32(FAR_AWAY))
         nearest[k] = min(nearest[k], apart)
 
 
@@ -616,7 +617,7 @@ def _weigh(windows, to, scale, full):
     to = u64(to)
     for k in range(u64(full)):
         d = across[to + k]
-        w = _exp(scale * (d - nearest[k])) + (f32(LATERAL) if d < f32(_FAR_AWAY) else f32(0.0))
+        w = _exp(scale * (d - nearest[k])) + (f32(LATERAL) if d < f32(FAR_AWAY) else f32(0.0))
         both[k] += w * _exp(scale * along[to + k])
         weight[k] += w
 
@@ -634,7 +635,7 @@ def _odds(windows, norm, count, odds, to):
     to = u64(to)
     for k in range(u64(_WIDE)):
         mixture = both[k] / weight[k] * np.sqrt(norm2[k]) * norm / outlier[k]
-        odds[to + k] = mixture if (nearest[k] < f32(_FAR_AWAY) and k < u64(count)) else f32(1.0)
+        odds[to + k] = mixture if (nearest[k] < f32(FAR_AWAY) and k < u64(count)) else f32(1.0)
 
 
 @_lanes
@@ -646,9 +647,9 @@ def _fill(array, count, value):
 @_whole
 def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
     """Densities of inliers over those of outliers at every sigma, of the windows' points in an image."""
-    full = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+    full = _whole_vectors(count)
     step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
-    _fill(windows.nearest, full, f32(_FAR_AWAY))
+    _fill(windows.nearest, full, f32(FAR_AWAY))
     to = 0
     for dv in range(-border, border + 1):
         for du in range(-border, border + 1):
@@ -694,7 +695,7 @@ def _boxes(things, n, objects, picture, boxes):
 
 
 @_whole
-def _draw_objects(things, n, objects, boxes, patch, stride, shift, space):
+def _draw_objects(things, n, objects, picture, boxes, patch, stride, shift, space):
     for k in range(objects):
         if boxes[k, 1] > boxes[k, 0]:
             thing = n * objects + k
@@ -703,14 +704,14 @@ def _draw_objects(things, n, objects, boxes, patch, stride, shift, space):
             _draw_object(
                 things.words, things.first[kind], things.dims[3 * kind : 3 * kind + 3],
                 things.origin[3 * kind : 3 * kind + 3], things.size[kind], things.pose[12 * thing : 12 * thing + 12],
-                box, patch, stride, shift, space,
+                picture, box, patch, stride, shift, space,
             )  # fmt: skip
 
 
 @_whole
-def _draw_planes(plane, picture, patch, stride, shift, space):
+def _draw_planes(plane, picture, patch, stride, shift):
     for v in range(len(picture.ray_y)):
-        _draw_plane(plane, plane[3], space.column_x, space.row_y[v], patch, v * stride + shift)
+        _draw_plane(plane, plane[3], picture.ray_x, picture.ray_y[v], patch, v * stride + shift)
 
 
 @_whole
@@ -734,7 +735,7 @@ def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
             )
     else:
         _fill(space.patch, size, f32(_NOTHING))
-    _fill_whole(space.kind, size)
+    _fill(space.kind, size, i32(0))
     for v in range(top, bottom):
         at = (v - top + border) * stride + border
         _copy_returns(picture, v * width + left, right - left, space.depth, space.kind, at)
@@ -749,7 +750,6 @@ def _gains(
     count, border = len(planes) // 4, window // 2
     objects, levels = len(things.kind) // count, len(sigma) * len(p_outlier)
     with_scenes = len(scenes) > 0
-    _make_rays(picture, space)
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
         flat = everywhere and _is_plane(plane)
@@ -764,8 +764,8 @@ def _gains(
         stride, size, left, top = _begin(picture, scenes, scene_at, scene_shape[1], rectangle, border, space)
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
-            _draw_planes(plane, picture, space.patch, stride, shift, space)
-        _draw_objects(things, n, objects, boxes, space.patch, stride, shift, space)
+            _draw_planes(plane, picture, space.patch, stride, shift)
+        _draw_objects(things, n, objects, picture, boxes, space.patch, stride, shift, space)
         low, high = _mark(space.patch, space.before, size, space.changed)
         _windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -801,44 +801,22 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
     with, or none, and what each hypothesis adds."""
     count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
     objects = len(things.kind) // count
-    _make_rays(picture, space)
     for n in range(count):
         image = depth[n * pixels : (n + 1) * pixels]
         for k in range(pixels):
             image[k] = min(start[n * pixels + k], f32(_NOTHING)) if len(start) > 0 else f32(_NOTHING)
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
-            _draw_planes(plane, picture, image, columns, shift, space)
+            _draw_planes(plane, picture, image, columns, shift)
         _boxes(things, n, objects, picture, boxes)
-        _draw_objects(things, n, objects, boxes, image, columns, shift, space)
+        _draw_objects(things, n, objects, picture, boxes, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
 
 @_whole
-def _make_rays(picture, space):
-    """The rays (x, y, 1) of the camera's columns and rows."""
-    for u in range(len(picture.ray_x)):
-        space.column_x[u] = (f32(u) - picture.centre_x) / picture.focal_x
-    for v in range(len(picture.ray_y)):
-        space.row_y[v] = (f32(v) - picture.centre_y) / picture.focal_y
-
-
-@_whole
 def _is_plane(plane):
     return abs(plane[0] + plane[1] + plane[2] + plane[3]) < _NOTHING  # not NaN
-
-
-@_lanes
-def _fill_bytes(array, count):
-    for k in range(u64(count)):
-        array[k] = np.uint8(0)
-
-
-@_lanes
-def _fill_whole(array, count):
-    for k in range(u64(count)):
-        array[k] = i32(0)
 
 
 @_whole
@@ -879,7 +857,7 @@ def _depth(frame):
         return 0
     things, planes = _things(frame), floats(frame, 7)
     numbers, shape, start = floats(frame, 10), integers(frame, 12), floats(frame, 11)
-    picture = Picture(
+    picture = Picture(  # of which only the camera counts: nothing was observed
         start, things.kind, floats(frame, 8), floats(frame, 9),
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
