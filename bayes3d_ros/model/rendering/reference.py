@@ -1,10 +1,16 @@
-"""The slow renderer that defines the right answer: every ray against every voxel, in float64 numpy."""
+"""The slow renderer that defines the right answer, float64: every ray against every voxel that it may enter."""
+
+from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from bayes3d_ros.model.objects import ObjectModel
 from bayes3d_ros.model.rendering.voxel_march import INFLATION
+
+_CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
+_AT_A_TIME = 256  # rays, which bounds memory
 
 
 def render(
@@ -20,28 +26,59 @@ def render(
     directions = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
     surface = np.zeros(model.occupancy.shape, bool)
     surface[tuple(model.surface_index.T)] = True
-    interior = np.argwhere(model.occupancy & ~surface) + 0.5
-    return np.array([min(_surface_hit(model, eye, d, near), _interior_hit(interior, eye, d, near)) for d in directions])
+    depth = np.full(len(rays), np.inf)
+    from_eye = model.surface_index + 0.5 - eye
+    for ray, cube in _pairs(from_eye, directions):
+        np.minimum.at(depth, ray, _surface_hit(model, cube, from_eye[cube], directions[ray], near))
+    from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
+    for ray, cube in _pairs(from_eye, directions):
+        np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], near))
+    return depth
 
 
-def _cube(centres: np.ndarray, eye: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a ray enters and leaves unit cubes."""
-    ends = np.stack([(centres - 0.5 - eye) / direction, (centres + 0.5 - eye) / direction])
+def _pairs(
+    from_eye: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "P 3"]
+) -> Iterator[tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]]:
+    """Rays and unit cubes that may meet, in parts: no cube ahead whose corner is near enough is left out."""
+    if not len(from_eye):
+        return
+    distance = np.linalg.norm(from_eye, axis=1)
+    close = distance.min() <= 2 * _CORNER  # then anything may meet
+    tree = None if close else cKDTree(from_eye / distance[:, None])
+    chord = 2 * np.sin(0.5 * np.arcsin(_CORNER / max(distance.min(), 2 * _CORNER)))
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    for first in range(0, len(unit), _AT_A_TIME):
+        some = unit[first : first + _AT_A_TIME]
+        found = [np.arange(len(from_eye))] * len(some) if tree is None else tree.query_ball_point(some, chord)
+        yield first + np.repeat(np.arange(len(some)), [len(f) for f in found]), np.concatenate(found).astype(int)
+
+
+def _cube(from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Where a ray enters and leaves a unit cube."""
+    ends = np.stack([(from_eye - 0.5) / direction, (from_eye + 0.5) / direction])
     return ends.min(0).max(-1), ends.max(0).min(-1)
 
 
-def _interior_hit(centres: np.ndarray, eye: np.ndarray, direction: np.ndarray, near: float) -> float:
-    enter, leave = _cube(centres, eye, direction)
-    return np.where((enter <= leave) & (enter > near), enter, np.inf).min(initial=np.inf)
+def _interior_hit(
+    from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"], near: float
+) -> Float[np.ndarray, "N"]:
+    enter, leave = _cube(from_eye, direction)
+    return np.where((enter <= leave) & (enter > near), enter, np.inf)
 
 
-def _surface_hit(model: ObjectModel, eye: np.ndarray, direction: np.ndarray, near: float) -> float:
-    centres = model.surface_index + 0.5
-    enter, leave = _cube(centres, eye, direction)
-    facing = model.surface_normal @ direction
+def _surface_hit(
+    model: ObjectModel,
+    voxel: Int[np.ndarray, "N"],
+    from_eye: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "N 3"],
+    near: float,
+) -> Float[np.ndarray, "N"]:
+    normal = model.surface_normal[voxel]
+    enter, leave = _cube(from_eye, direction)
+    facing = (normal * direction).sum(-1)
     facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
-    offset = model.surface_offset / model.voxel_size
-    meet = (offset - np.einsum("sa,sa->s", model.surface_normal, eye - centres)) / facing
-    reach = np.abs(eye + meet[:, None] * direction - centres).max(-1)
+    offset = model.surface_offset[voxel] / model.voxel_size
+    meet = (offset + (normal * from_eye).sum(-1)) / facing
+    reach = np.abs(meet[:, None] * direction - from_eye).max(-1)
     met = (enter <= leave) & (reach <= 0.5 + INFLATION) & (meet > near)
-    return np.where(met, meet, np.inf).min(initial=np.inf)
+    return np.where(met, meet, np.inf)
