@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.evaluation.pose_noise import disturbed
 from bayes3d_ros.evaluation.random_scenes import CAMERA, RestingObject, perfect_depth
-from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import unproject
+from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.inference.object_learning import Learned
 from bayes3d_ros.model.observation import DepthFrame
 

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.evaluation.ray_casting import RayCaster
-from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import Intrinsics, project
 from bayes3d_ros.geometry.mesh import load_mesh
+from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.model.objects import ObjectModel
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.rendering import reference

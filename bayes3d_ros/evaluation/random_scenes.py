@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.evaluation.correlated_errors import draw_correlated_errors
 from bayes3d_ros.evaluation.ray_casting import RayCaster, Rendering, SimulationError
 from bayes3d_ros.evaluation.resting import placed, resting_normals, turn
-from bayes3d_ros.evaluation.scene_file import direction, look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.camera import Intrinsics, project
+from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.model.observation import DepthFrame
 
 CAMERA = Intrinsics(615.0, 615.0, 319.5, 239.5, 640, 480)  # a D435

@@ -14,6 +14,7 @@ from bayes3d_ros.evaluation.ray_casting import SimulationError
 from bayes3d_ros.evaluation.resting import placed, rest_rotation
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.poses import look_at
 
 _INTRINSICS = {"width": 640, "height": 480, "fx": 615.0, "fy": 615.0, "cx": 319.5, "cy": 239.5}
 
@@ -59,24 +60,6 @@ def load_scene(path: Path) -> Scene:
         return _scene(path, content)
     except ValueError as error:
         raise SimulationError(f"{path}: {error}") from None
-
-
-def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
-    """The unit vector at an angle (radians) from x about z, and one above the x-y plane."""
-    return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-
-
-def look_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """T_table_camera of a camera at `eye` whose optical axis meets `target`, with its image upright."""
-    z = target - eye
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    if np.linalg.norm(x) < 1e-9:
-        raise ValueError("camera: expected a target that is not straight above or below the eye, or on it")
-    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    pose[:3, 3] = eye
-    return pose
 
 
 def find_mesh(source: str, folder: Path) -> trimesh.Trimesh:

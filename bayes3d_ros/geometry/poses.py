@@ -10,3 +10,24 @@ def pose_matrix(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, 
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return T
+
+
+def direction(
+    azimuth: Float[np.ndarray, "*n"] | float, elevation: Float[np.ndarray, "*n"] | float
+) -> Float[np.ndarray, "*n 3"]:
+    """Unit vectors at an angle (radians) from x about z, and one above the x-y plane."""
+    return np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
+
+
+def look_at(eye: Float[np.ndarray, "*n 3"], target: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
+    """T_world_camera of a camera at `eye` whose optical axis meets `target`, its image upright where z is up. Raises
+    ValueError where neither is so."""
+    z = target - eye
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    if np.linalg.norm(x, axis=-1).min() < 1e-9:
+        raise ValueError("camera: expected a target that is not straight above or below the eye, or on it")
+    x, z = (a / np.linalg.norm(a, axis=-1, keepdims=True) for a in (x, z))
+    pose = np.zeros((*np.shape(z)[:-1], 4, 4))
+    pose[..., :3, :3] = np.stack([x, np.cross(z, x), z], -1)
+    pose[..., :3, 3], pose[..., 3, 3] = eye, 1.0
+    return pose

@@ -15,9 +15,10 @@ pytest.importorskip("mujoco", reason="the simulator needs MuJoCo (extra: sim)")
 from bayes3d_ros.bags import BagError, read_frames
 from bayes3d_ros.evaluation.ray_casting import Box, RayCaster, SimulationError
 from bayes3d_ros.evaluation.resting import rest_rotation, resting_normals, turn
-from bayes3d_ros.evaluation.scene_file import find_mesh, load_scene, look_at
+from bayes3d_ros.evaluation.scene_file import find_mesh, load_scene
 from bayes3d_ros.evaluation.simulation import scene_caster, simulate, visible_fractions
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
+from bayes3d_ros.geometry.poses import look_at
 
 CAMERA = Intrinsics(150.0, 160.0, 79.5, 59.5, 160, 120)
 SCENE = {

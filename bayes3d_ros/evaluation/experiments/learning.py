@@ -21,9 +21,9 @@ from bayes3d_ros.evaluation.plots import INK, colour
 from bayes3d_ros.evaluation.random_scenes import CAMERA, RestingObject, resting_object
 from bayes3d_ros.evaluation.ray_casting import Box, RayCaster
 from bayes3d_ros.evaluation.resting import placed, rest_rotation
-from bayes3d_ros.evaluation.scene_file import look_at
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
 from bayes3d_ros.geometry.mesh import load_mesh
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.inference.object_learning import Learned, learn
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import LearnerSettings
