@@ -205,12 +205,15 @@ def learn(
 @click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
 @click.option("--out", required=True, type=FOLDER, help="Folder for cameras.jsonl and track.png.")
 @click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--world", type=ANY, help="Known objects and their poses (yaml); default: what the first frame shows.")
 @click.option("--hypotheses", type=int, help="Camera poses scored for every frame; default 1024.")
 @click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the tracker.")
 @_device_option
-def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
-    """Follow the camera of BAG around what its first frame shows."""
+def track(
+    bag: Path, library: Path, out: Path, topic: str | None, world: Path | None, more: tuple[str, ...], **options: Any
+) -> None:
+    """Follow the camera of BAG around what its first frame shows, or around a known world."""
     from bayes3d_ros.bags import read_frames
     from bayes3d_ros.evaluation.tracking_results import PICTURE, TrackWriter, plot_track
     from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
@@ -220,13 +223,15 @@ def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
     from bayes3d_ros.model.objects import load_library
     from bayes3d_ros.model.posterior import ParseError
+    from bayes3d_ros.model.world_file import load_world
 
     settings = _settings(TrackerSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic)
     enable_cache()
     every_core()
-    follower = CameraFollower(CameraTracker(models, settings), SceneParser(models))
+    told = None if world is None else load_world(world, settings.table, models)
+    follower = CameraFollower(CameraTracker(models, settings), SceneParser(models), told)
     known: Tracking | None = None
     done: list[CameraEstimate] = []
     recorded, failed = [], 0
@@ -245,10 +250,10 @@ def track(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     if not done:
         raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
     lost = sum(bool(estimate.lost) for estimate in done)
-    told = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
-    told += f", {failed} could not be" if failed else ""
-    plot_track(done, out / PICTURE, f"{bag.name}   {frames.depth_topic}   {told}", recorded)
-    click.echo(f"{told}; results in {out}")
+    summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
+    summary += f", {failed} could not be" if failed else ""
+    plot_track(done, out / PICTURE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
+    click.echo(f"{summary}; results in {out}")
 
 
 def _camera_line(estimate: "CameraEstimate") -> str:

@@ -76,6 +76,7 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from bayes3d_ros.geometry.mesh import MeshError
     from bayes3d_ros.inference.object_learning import LearningError
     from bayes3d_ros.mcap_files import BagError
+    from bayes3d_ros.model.camera_estimate import WorldError
     from bayes3d_ros.model.objects import LibraryError
 
-    return BagError, LearningError, LibraryError, MeshError, ResultsError, SimulationError
+    return BagError, LearningError, LibraryError, MeshError, ResultsError, SimulationError, WorldError

@@ -294,15 +294,15 @@ def test_learn_says_in_one_line_what_is_wrong(tmp_path, options, message):
 def followers(monkeypatch, parsers):
     """A stand-in for the tracker: one metre above the world, lost on the stamps in `lost`, raising on those in
     `failing`."""
-    told = SimpleNamespace(lost=set(), failing=set(), settings=[])
+    told = SimpleNamespace(lost=set(), failing=set(), settings=[], worlds=[])
 
     class Tracker:
         def __init__(self, models, settings):
             told.settings.append(settings)
 
     class Follower:
-        def __init__(self, tracker, parser):
-            pass
+        def __init__(self, tracker, parser, world):
+            told.worlds.append(world)
 
         def step(self, known, frame):
             if frame.stamp_ns in told.failing:
@@ -347,6 +347,19 @@ def test_track_writes_a_line_a_frame_and_a_picture(bag, library, followers, tmp_
     assert np.shape(lines[0]["covariance"]) == (6, 6)
     assert "lost: out of sight" in result.stdout and "3 frames tracked, lost in 1" in result.stdout
     assert (out / "track.png").stat().st_size > 10_000
+
+
+def test_track_around_a_known_world(bag, library, followers, tmp_path):
+    file, name = tmp_path / "world.yaml", next(library.glob("*.npz")).stem
+    file.write_text(f"objects: [{{type: {name}, position: [0.1, 0, 0], orientation: [0, 0, 0, 1]}}]")
+    result = run("track", bag, "--library", library, "--out", tmp_path / "out", "--world", file)
+    assert result.exit_code == 0, result.output
+    assert followers.worlds[0].types == (name,) and followers.worlds[0].T_world_object[0, 0, 3] == 0.1
+    file.write_text(file.read_text().replace(name, "nothing"))
+    wrong = run("track", bag, "--library", library, "--out", tmp_path / "o", "--world", file)
+    assert_one_line(wrong, 2, "world.yaml: objects[0].type: expected an object of the library, it has no 'nothing'")
+    absent = run("track", bag, "--library", library, "--out", tmp_path / "o", "--world", tmp_path / "none")
+    assert_one_line(absent, 2, "none: expected a readable world file")
 
 
 def test_track_goes_on_after_a_frame_that_fails_and_fails_if_all_do(bag, library, followers, tmp_path):

@@ -13,11 +13,13 @@ from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.inference import pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
+from bayes3d_ros.inference.camera_search import LookAt, find_camera
+from bayes3d_ros.inference.depth_alignment import Scene, rendered_slopes
 from bayes3d_ros.inference.noise import for_returns, noise_grid
 from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.scene_parsing import SceneParser, frame_key
 from bayes3d_ros.inference.settings import TrackerSettings
-from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError
+from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
@@ -26,7 +28,7 @@ from bayes3d_ros.model.motions import exp_about, inverse, log_about, product, qu
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
 from bayes3d_ros.model.pose_statistics import rotation_mean, second_moment
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.model.posterior import ParseError, ScenePosterior
 from bayes3d_ros.model.sharding import on_all
 
 _NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
@@ -46,7 +48,7 @@ class Tracking:
     """What is known between two frames."""
 
     world: KnownWorld
-    scene: pose_filter.Scene
+    scene: Scene
     particles: pose_filter.State
     stamp_ns: int | None = None  # of the last frame
     frame_time: float = 0.0  # seconds between the last two frames
@@ -70,17 +72,17 @@ class CameraTracker:
         self._smooth = jax.jit(_smooth_covariance)
 
     def start(self, world: KnownWorld, T_world_camera: Float[np.ndarray, "4 4"]) -> Tracking:
-        """A camera at rest at a pose that is roughly known. Raises TrackingError for a world without objects, or with
-        ones that the library lacks."""
+        """A camera at rest at a pose that is roughly known. Raises WorldError for a world without objects, or with ones
+        that the library lacks."""
         if not world.types:
-            raise TrackingError("no object in sight to track the camera by")
+            raise WorldError("no object in sight to track the camera by")
         missing = sorted(set(world.types) - set(self.library.names))
         if missing:
-            raise TrackingError(f"expected objects of the library, it has no {', '.join(missing)}")
+            raise WorldError(f"expected objects of the library, it has no {', '.join(missing)}")
         kind = jnp.array([self.library.names.index(name) for name in world.types], jnp.int32)
         placed = jnp.asarray(world.T_world_object, jnp.float32)
         pivot = jnp.asarray(self._spheres(world)[0].mean(0), jnp.float32)
-        scene = pose_filter.Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
+        scene = Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
         return Tracking(world, on_all(scene, self._devices), self._at_rest(T_world_camera))
 
     def _at_rest(self, T_world_camera: Float[np.ndarray, "4 4"]) -> pose_filter.State:
@@ -170,6 +172,17 @@ class CameraTracker:
                 best, best_score = some[int(value.argmax())], float(value.max())
         return replace(known, particles=self._at_rest(best), stamp_ns=None, frame_time=0.0)
 
+    def look_for(self, known: Tracking, frame: DepthFrame) -> Tracking:
+        """The camera where only a frame tells of it: by the paper's look-at prior, about the middle of the objects.
+        Raises TrackingError for a frame without returns, ParseError for one without the world's table."""
+        settings = self.settings
+        prior = LookAt(
+            settings.nearest_camera, settings.farthest_camera, settings.lowest_camera, settings.highest_camera
+        )
+        image = self._image(frame, known.world, None)
+        found = find_camera(prior, known.scene, image, settings.window, settings.seed)
+        return replace(known, particles=self._at_rest(found), stamp_ns=None, frame_time=0.0)
+
     def _spheres(self, world: KnownWorld) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
         """Middles, in the world, and radii of what encloses the objects' boxes."""
         models = [self.library.models[self.library.names.index(name)] for name in world.types]
@@ -177,18 +190,23 @@ class CameraTracker:
         centres = np.einsum("kab,kb->ka", world.T_world_object[:, :3, :3], local) + world.T_world_object[:, :3, 3]
         return centres, np.array([0.5 * np.linalg.norm(m.box_size) for m in models])
 
-    def _image(self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]) -> Image:
+    def _image(self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"] | None) -> Image:
         """The image at scoring resolution. What lies neither near the table nor near an object, as far as the expected
-        pose tells, is none of the world's: not scored where there is a table, else beyond the objects."""
+        pose tells, is none of the world's: not scored where there is a table, else beyond the objects. Without a pose
+        any return may be the world's."""
         settings = self.settings
         camera, depth, _, returned = reduced(frame, settings.score_width, settings.near, settings.far)
         if not returned.any():
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
         rays = camera.rays()
+        if T_camera_world is None:
+            kind = np.where(returned, IN_WORKSPACE, NO_RETURN)
+        else:
+            kind = self._kinds(points, world, T_camera_world)
         fields = {
             "depth": np.where(returned, depth, 0.0).astype(np.float32),
-            "kind": self._kinds(points, world, T_camera_world).astype(np.int32),
+            "kind": kind.astype(np.int32),
             "ray_x": rays[0, :, 0].astype(np.float32),
             "ray_y": rays[:, 0, 1].astype(np.float32),
             "focal": np.array([camera.fx, camera.fy], np.float32),
@@ -218,27 +236,43 @@ class CameraTracker:
 
 
 class CameraFollower:
-    """A tracker with a parser, which finds the world in the first frame and the camera when it is lost."""
+    """A tracker with a parser, which finds the world in the first frame and the camera when it is lost. In a world
+    that is known beforehand the first pose is the recorded one, or else looked for, as it is where parsing does not
+    help."""
 
-    def __init__(self, tracker: CameraTracker, parser: SceneParser) -> None:
+    def __init__(self, tracker: CameraTracker, parser: SceneParser, world: KnownWorld | None = None) -> None:
+        """Raises WorldError for a world without objects, or with ones that the library lacks."""
         self.tracker, self.parser = tracker, parser
+        self._told = None if world is None else tracker.start(world, np.eye(4))
 
     def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         """One frame, the first one where nothing is known yet. Raises TrackingError or ParseError, and then what was
         known still is."""
-        settings = self.tracker.settings
         if known is None:
-            posterior = self.parser.parse(frame)
-            world, T_world_camera = world_of(posterior, settings.table)
-            found, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
-            return found, replace(estimate, found_again=True)
-        late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > settings.longest_gap
+            return self._found(self._first(frame), frame)
+        longest = self.tracker.settings.longest_gap
+        late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > longest
         if not late:
             now, estimate = self.tracker.step(known, frame)
             if not estimate.lost:
                 return now, estimate
-        found = self.tracker.relocalise(known, self.parser.parse(frame), frame)
-        now, estimate = self.tracker.step(found, frame)
+        try:
+            found = self.tracker.relocalise(known, self.parser.parse(frame), frame)
+        except (TrackingError, ParseError):
+            if self._told is None:
+                raise
+            found = self.tracker.look_for(known, frame)
+        return self._found(found, frame)
+
+    def _first(self, frame: DepthFrame) -> Tracking:
+        if self._told is None:
+            return self.tracker.start(*world_of(self.parser.parse(frame), self.tracker.settings.table))
+        if frame.T_table_camera is not None:
+            return self.tracker.start(self._told.world, frame.T_table_camera)
+        return self.tracker.look_for(self._told, frame)
+
+    def _found(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        now, estimate = self.tracker.step(known, frame)
         return now, replace(estimate, found_again=True)
 
 
@@ -267,7 +301,7 @@ def _slower(motion: Float[Array, "N 4 4"], ratio: Float[Array, ""]) -> Float[Arr
 
 
 def _smooth_covariance(
-    T_camera_world: Float[Array, "4 4"], image: Image, scene: pose_filter.Scene, error: SmoothError
+    T_camera_world: Float[Array, "4 4"], image: Image, scene: Scene, error: SmoothError
 ) -> tuple[Float[Array, "6 6"], Float[Array, ""], Float[Array, ""]]:
     """What smooth errors add to the covariance of (shift, turn) about the pivot, on the camera's axes; the share of the
     objects' pixels that are explained, and how many there are."""
@@ -276,7 +310,7 @@ def _smooth_covariance(
     def pose(tangent: Array) -> Array:
         return product(exp_about(tangent, pivot), T_camera_world)
 
-    depth, slope, seen = pose_filter.rendered_slopes(pose, jnp.zeros(6), image, scene)
+    depth, slope, seen = rendered_slopes(pose, jnp.zeros(6), image, scene)
     rays = jnp.broadcast_to(image.ray_x, depth.shape), jnp.broadcast_to(image.ray_y[:, None], depth.shape)
     points = depth[..., None] * jnp.stack([*rays, jnp.ones_like(depth)], -1)
     inner = seen & (jnp.abs(slope[:3]).max(0) < _STEEP)

@@ -20,15 +20,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.inference import noise as noise_model
+from bayes3d_ros.inference.depth_alignment import RENDERED, Scene, aligned, information, rendered_slopes
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.resampling import effective_fraction, normalised, systematic
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
+from bayes3d_ros.model.camera_score import log_likelihood_of_cameras
 from bayes3d_ros.model.image import Image, halved
-from bayes3d_ros.model.library_arrays import LibraryArrays
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import Noise
 from bayes3d_ros.model.motions import exp_about, inverse, log_about, log_volume, product, rigid
 from bayes3d_ros.model.sharding import over_devices
 
@@ -39,8 +39,6 @@ _STARTS = 2  # of alignment
 _LEAST_OUTLIERS = 0.02  # p_outlier while searching: with less, one bad pixel decides
 _REACH = (0.03, 0.015, 0.006, 0.003, 0.0015, 0.0008)  # metres: residuals beyond count little, step by step,
 _LEAST_REACH = (4.0, 0.003)  # but none so small, in sigmas and at most in metres
-_DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians, for slopes
-_RENDERED = 1 + 2 * len(_DELTA)  # images that an alignment's step looks at
 _KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
 _WIDEN = 1.2  # of the scale learned from a round, for the next
 _ANCESTORS = 32  # of the particles, that draws may have moved from
@@ -55,14 +53,6 @@ class Motion(NamedTuple):
 
     shift: Float[Array, ""] | np.floating  # metres
     turn: Float[Array, ""] | np.floating  # radians
-
-
-class Scene(NamedTuple):
-    """What is fixed while a camera is tracked."""
-
-    world: World
-    library: LibraryArrays
-    pivot: Float[Array, "3"]  # of the world: motions are described about it, where shift and turn do not mix
 
 
 class State(NamedTuple):
@@ -241,7 +231,7 @@ def step(
 def shares(hypotheses: int) -> tuple[int, int]:
     """Of the hypotheses of a frame: those of a round of the search, and the filter's own draws, its particles. The rest
     serves alignment. Raises ValueError for too few."""
-    each, aligning = int(_ROUND_SHARE * hypotheses), _STARTS * (1 + _RENDERED * (1 + len(_REACH)))
+    each, aligning = int(_ROUND_SHARE * hypotheses), _STARTS * (1 + RENDERED * (1 + len(_REACH)))
     own = hypotheses - len(_BLURS) * each - aligning
     if own < each:
         least = ceil(aligning / (1 - (1 + len(_BLURS)) * _ROUND_SHARE) - 1e-9)  # 460, not 460 and a rounding error
@@ -301,41 +291,15 @@ def _aligned(
     scale: Float[Array, "6"],
     sigma: Float[Array, ""],
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
-    """Gauss-Newton on the differences between observed and rendered depth; where it ends, and the scale of the errors
-    left, if they are independent and as large as sigma."""
-
-    def information(slope: Array, weight: Array) -> Array:
-        return jnp.einsum("ahw,hw,bhw->ab", slope, weight, slope, precision=jax.lax.Precision.HIGHEST)
-
-    def one(mean: Array, reach: Array) -> tuple[Array, None]:
-        depth, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
-        residual = jnp.where(seen, image.depth - depth, 0.0)
-        weight = jnp.where(seen, 1 / (1 + (residual / reach) ** 2) ** 2, 0.0) / reach**2
-        pull = jnp.einsum("ahw,hw,hw->a", slope, weight, residual, precision=jax.lax.Precision.HIGHEST)
-        square = information(slope * scale[:, None, None], weight) + 0.01 * jnp.eye(6)
-        return mean + scale * jnp.linalg.solve(square, scale * pull), None
-
+    """Where alignment ends, and the scale of the errors left if they are independent and as large as sigma."""
     least = jnp.minimum(_LEAST_REACH[0] * sigma, _LEAST_REACH[1])
-    mean, _ = jax.lax.scan(one, start, jnp.maximum(jnp.array(_REACH), least))
+    mean = aligned(chart.pose, start, image, scene, scale, jnp.maximum(jnp.array(_REACH), least))
     _, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
     # With ones on the diagonal: metres and radians, and a prior a thousand times wider, are too much for float32.
     precision = information(slope, jnp.where(seen, 1 / sigma**2, 0.0)) + jnp.diag(1 / scale**2)
     unit = 1 / jnp.sqrt(jnp.diag(precision))
     covariance = jnp.linalg.inv(precision * unit[:, None] * unit + 1e-4 * jnp.eye(6))
     return mean, unit[:, None] * jnp.linalg.cholesky(covariance)
-
-
-def rendered_slopes(
-    pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]], at: Float[Array, "6"], image: Image, scene: Scene
-) -> tuple[Float[Array, "H W"], Float[Array, "6 H W"], Bool[Array, "H W"]]:
-    """Rendered depth at a tangent that `pose` makes a camera pose of, its slopes along the tangent, and where there
-    are both and a return; zero elsewhere."""
-    delta = jnp.array(_DELTA)
-    around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
-    depth = render_cameras(pose(at + around), scene.world, image, scene.library)
-    seen = (image.kind == IN_WORKSPACE) & jnp.isfinite(depth).all(0)
-    depth = jnp.where(seen, depth, 0.0)
-    return depth[0], (depth[1:7] - depth[7:]) / (2 * delta[:, None, None]), seen
 
 
 def _propose(

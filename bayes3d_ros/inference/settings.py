@@ -160,6 +160,16 @@ class TrackerSettings:
     longest_gap: float = setting(
         1.0, "after so long without a frame the camera is looked for anew", unit="s", low=0.01, high=60.0
     )
+    nearest_camera: float = setting(
+        0.3,
+        "where only a known world tells of the camera: how near it may be to the objects",
+        unit="m",
+        low=0.05,
+        high=100.0,
+    )
+    farthest_camera: float = setting(1.5, "and how far from them", unit="m", low=0.05, high=100.0)
+    lowest_camera: float = setting(0.2, "how low it may look down at them", unit="rad", low=-1.5, high=1.5)
+    highest_camera: float = setting(1.4, "and how steeply", unit="rad", low=-1.5, high=1.5)
     least_explained: float = setting(
         0.5, "share of the objects' pixels that have to be explained, or the camera is lost", low=0.0, high=1.0
     )
@@ -178,3 +188,5 @@ class TrackerSettings:
         validate(self)
         _odd_window(self.window)
         _near_before_far(self.near, self.far)
+        if self.nearest_camera > self.farthest_camera or self.lowest_camera > self.highest_camera:
+            raise ValueError("nearest_camera and lowest_camera must not exceed farthest_camera and highest_camera")

@@ -10,6 +10,10 @@ class TrackingError(Exception):
     """A frame, or a scene, that a camera cannot be tracked with; one line that says why."""
 
 
+class WorldError(TrackingError):
+    """A world that no camera can be tracked in; one line that says why."""
+
+
 @dataclass(frozen=True)
 class KnownWorld:
     """Objects at rest, in a frame of their own: the table's where there is one (z up, origin on the table)."""

@@ -25,9 +25,10 @@ from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker,
 from bayes3d_ros.inference.compilation import enable_cache, every_core
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import TrackerSettings
-from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
+from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.posterior import ParseError
+from bayes3d_ros.model.world_file import load_world
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, one_line, why_no_input
@@ -36,7 +37,7 @@ from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
 
 _RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-_TRACKER_PARAMETERS = ("library", *(f.name for f in fields(TrackerSettings)))
+_TRACKER_PARAMETERS = ("library", "world", *(f.name for f in fields(TrackerSettings)))
 _INPUT_PARAMETERS = ("qos_reliability", "table_frame", "camera_pose", "patience")
 
 
@@ -53,14 +54,14 @@ class _Session(NamedTuple):
     backend: str
 
 
-def make_follower(library: Library, settings: TrackerSettings) -> Follower:
-    """A tracker for the objects of a library, and a parser for its first frame."""
-    return CameraFollower(CameraTracker(library, settings), SceneParser(library))
+def make_follower(library: Library, settings: TrackerSettings, world: KnownWorld | None) -> Follower:
+    """A tracker for the objects of a library, and a parser for its first frame, or a world that is known."""
+    return CameraFollower(CameraTracker(library, settings), SceneParser(library), world)
 
 
 class CameraTrackerNode(Node):
-    """The first frame's objects are the world, in table_frame; ~/reset forgets them. While the camera is lost no pose
-    goes out and /diagnostics says why."""
+    """The world is the first frame's objects, in table_frame, or a file's; ~/reset begins anew.
+    While the camera is lost no pose goes out and /diagnostics says why."""
 
     def __init__(self, make=make_follower) -> None:
         super().__init__("camera_tracker")
@@ -101,12 +102,13 @@ class CameraTrackerNode(Node):
     def _begin(self) -> str:
         """Have the worker make a tracker from the parameters as they are now; what is wrong, or empty."""
         try:
-            folder = self._settings.read(CameraTrackerNodeSettings).library
+            node = self._settings.read(CameraTrackerNodeSettings)
             settings = self._settings.read(TrackerSettings)
-            if not folder:
+            if not node.library:
                 raise ValueError("parameter library is not set: expected a folder of object models (bayes3d import)")
-            library = load_library(Path(folder).expanduser())
-        except (ValueError, LibraryError) as error:
+            library = load_library(Path(node.library).expanduser())
+            world = load_world(Path(node.world).expanduser(), settings.table, library) if node.world else None
+        except (ValueError, LibraryError, WorldError) as error:
             self._refusal = str(error)
             self.get_logger().error(f"{error}; correct it, then call ~/reset")
             return str(error)
@@ -115,8 +117,9 @@ class CameraTrackerNode(Node):
         def job() -> None:
             self._known, self._session = None, None
             self._path.clear()
-            self._session = _Session(self._make(library, settings), jax.default_backend())
-            self.get_logger().info(f"the next frame shows the world; inference on {self._session.backend}")
+            self._session = _Session(self._make(library, settings, world), jax.default_backend())
+            told = "the next frame shows the world" if world is None else f"{len(world.types)} known objects"
+            self.get_logger().info(f"{told}; inference on {self._session.backend}")
 
         self._worker.call(job)
         return ""

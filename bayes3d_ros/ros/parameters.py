@@ -70,6 +70,7 @@ class CameraTrackerNodeSettings(DepthInputSettings):
     """What the camera_tracker node needs beside the tracker's own settings."""
 
     library: str = setting("", "folder of object models (bayes3d import); read when the node starts and on ~/reset")
+    world: str = setting("", "file of known objects and their poses in table_frame; empty: what the first frame shows")
     path_length: int = setting(1000, "poses kept on ~/path", low=1, high=1000000)
     most_particles: int = setting(200, "poses on ~/particles, drawn from the filter's", low=1, high=100000)
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.inference import camera_tracking, pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
+from bayes3d_ros.inference.camera_search import LookAt, over_table
 from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker
 from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.settings import TrackerSettings
@@ -127,6 +129,87 @@ def test_after_a_long_gap_the_camera_is_looked_for(tracker, world, frame):
     known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9 - 2 * 10**9)
     known, estimate = follower.step(known, frame(0, there))
     assert estimate.found_again and not estimate.lost
+
+
+@pytest.mark.parametrize("azimuth", [0.4, 2.5, 4.4])
+def test_in_a_known_world_the_camera_is_looked_for_all_around(tracker, world, frame, azimuth):
+    """Without a parser or a recorded pose; it looks a little past the objects, as no draw of the prior does."""
+    there = looking(azimuth, 0.5)
+    there[:3, :3] = there[:3, :3] @ Rotation.from_euler("xyz", [0.04, -0.05, 0.03]).as_matrix()
+    follower = CameraFollower(tracker, None, world)
+    known, estimate = follower.step(None, frame(0, there))
+    assert estimate.found_again and not estimate.lost
+    error = off(estimate, there)
+    assert np.abs(error[:3]).max() < 0.006 and np.abs(error[3:]).max() < 0.02
+    _, estimate = follower.step(known, frame(1, there))
+    assert not estimate.found_again and not estimate.lost
+
+
+def test_in_a_known_world_a_recorded_pose_is_where_tracking_starts(tracker, world, frame, monkeypatch):
+    there = looking(0.4)
+    monkeypatch.setattr(tracker, "look_for", None)
+    _, estimate = CameraFollower(tracker, None, world).step(None, replace(frame(0, there), T_table_camera=there))
+    assert not estimate.lost and np.abs(off(estimate, there)[:3]).max() < 0.006
+
+
+def test_a_lost_camera_is_looked_for_where_parsing_finds_nothing(tracker, world, frame):
+    def parse(seen):
+        return SimpleNamespace(objects=(), T_camera_table=np.eye(4))
+
+    here, there = looking(0.4), looking(3.6)
+    follower = CameraFollower(tracker, SimpleNamespace(parse=parse), world)
+    known, _ = follower.step(None, replace(frame(0, here), T_table_camera=here))
+    known, estimate = follower.step(known, frame(1, there))
+    assert estimate.found_again and not estimate.lost
+    assert np.abs(off(estimate, there)[:3]).max() < 0.006
+    with pytest.raises(TrackingError, match="found no object"):  # where the world is what a frame showed
+        CameraFollower(tracker, SimpleNamespace(parse=parse)).step(known, frame(100, there))
+
+
+def test_draws_of_the_look_at_prior():
+    """Within its intervals, evenly spread, upright; the target where it is to be seen."""
+    target, ahead = np.array([0.1, -0.2, 0.05]), np.array([0.0, 0.0, 1.0])
+    T = LookAt(0.4, 1.2, 0.3, 1.1).draw(4096, target, ahead, 0)
+    away = T[:, :3, 3] - target
+    distance = np.linalg.norm(away, axis=1)
+    values = {
+        (0.4, 1.2): distance,
+        (0.3, 1.1): np.arcsin(away[:, 2] / distance),
+        (-np.pi, np.pi): np.arctan2(away[:, 1], away[:, 0]),
+    }
+    for (low, high), value in values.items():
+        assert kstest((value - low) / (high - low), "uniform").statistic < 0.01
+    np.testing.assert_allclose(T[:, :3, 2], -away / distance[:, None], atol=1e-12)
+    np.testing.assert_allclose(T[:, 2, 0], 0, atol=1e-12)
+    assert (T[:, 2, 1] < 0).all()  # the image's y points down
+    aside = LookAt(0.4, 1.2, 0.3, 1.1).draw(64, target, np.array([0.2, -0.1, 1.0]), 0)
+    seen = np.linalg.inv(aside) @ np.append(target, 1.0)
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:3], np.tile([0.2, -0.1], (64, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(aside[:, :3, :3]), 1)
+
+
+def test_draws_over_a_table_see_it_as_it_was_seen():
+    T_world_camera, target = looking(0.7), np.array([0.05, 0.1, 0.08])
+    T_camera_table = np.linalg.inv(T_world_camera)  # the world's own: its z = 0
+    T = over_table(T_camera_table, 1024, target, 0)
+    np.testing.assert_allclose((T @ T_camera_table)[:, 2], np.tile([0.0, 0.0, 1.0, 0.0], (1024, 1)), atol=1e-12)
+    turn, place = (T @ T_camera_table)[:, :2, 0], (T @ T_camera_table)[:, :2, 3] - target[:2]
+    assert kstest(np.arctan2(*turn.T), "uniform", (-np.pi, 2 * np.pi)).statistic < 0.01
+    assert np.abs(place).max() < 0.25 and np.abs(place).max(0).min() > 0.24
+
+
+def test_a_camera_is_looked_for_without_a_table(tracker, world):
+    """What returns is the object's; only the paper's prior tells how near and how high."""
+    alone, there = replace(world, table=False), looking(2.2, 0.6)
+    there[:3, :3] = there[:3, :3] @ Rotation.from_euler("xyz", [0.05, -0.1, 0.02]).as_matrix()
+    scene = World(jnp.array([0]), jnp.asarray(alone.T_world_object, jnp.float32), jnp.asarray(False))
+    rays = CAMERA.rays()
+    pair = jnp.asarray(rays[..., 0]), jnp.asarray(rays[..., 1])
+    depth = np.array(_render(jnp.asarray(np.linalg.inv(there), jnp.float32), scene, tracker._arrays, pair))
+    depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+    known = tracker.look_for(tracker.start(alone, np.eye(4)), DepthFrame(depth, CAMERA, 10**9, "camera"))
+    found = np.linalg.inv(np.asarray(known.particles.T_camera_world[0], float))
+    assert np.abs(found[:3, 3] - there[:3, 3]).max() < 0.03
 
 
 def test_what_cannot_be_tracked_is_refused_in_a_line(tracker, world, frame):

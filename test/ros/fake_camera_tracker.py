@@ -14,7 +14,7 @@ from bayes3d_ros.ros.spinning import run
 class FakeFollower:
     """The camera stands as high above the world as the first return is far."""
 
-    def __init__(self, library, settings):
+    def __init__(self, library, settings, world):
         pass
 
     def step(self, known, frame):

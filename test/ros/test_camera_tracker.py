@@ -83,6 +83,7 @@ def test_a_lost_camera_has_no_pose_and_says_why(rig):
     [
         ({"library": "/nowhere"}, "/nowhere: no such library folder"),
         ({"library": "''"}, "parameter library is not set"),
+        ({"world": "/nowhere.yaml"}, "/nowhere.yaml: expected a readable world file"),
         ({"window": 4}, "window must be odd, got 4"),
         ({"hypotheses": 10}, "hypotheses"),
     ],
