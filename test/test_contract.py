@@ -157,7 +157,7 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
     def memory_row(case: benchmark.Case, library: Path) -> dict:
         return benchmark.parsing_row("memory", case, "640x480", [1.0], 0, peak_mib=300.0, peak_mib_at_first=200.0)
 
-    def tracked_row(library, thing, size: int, frames: str, hypotheses: int, number: int) -> dict:
+    def tracked_row(recordings, thing, size: int, frames: str, hypotheses: int) -> dict:
         return {"fps": 4.0}
 
     def node_row(case: benchmark.Case, library: Path, logs: Path) -> dict:

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 
 from bayes3d_ros.evaluation.benchmark import ycb_library
-from bayes3d_ros.evaluation.experiments.camera_tracking import OBJECTS, track_row
+from bayes3d_ros.evaluation.experiments.camera_tracking import OBJECTS, Recordings, track_row
 from bayes3d_ros.evaluation.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.model.objects import load_library
 
@@ -25,9 +25,9 @@ def rows() -> Iterator[SpeedRow]:
     """The mustard bottle's first frames from the independent renderer (`evaluate camera-tracking`)."""
     thing = next(iter(OBJECTS))
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
-        library = load_library(ycb_library((OBJECTS[thing],), Path(folder)))
+        recordings = Recordings(load_library(ycb_library((OBJECTS[thing],), Path(folder))), FRAMES)
     for size, hypotheses in CASES:
-        fps = track_row(library, thing, size, "independent", hypotheses, FRAMES)["fps"]
+        fps = track_row(recordings, thing, size, "independent", hypotheses)["fps"]
         yield speed_row("track", "ours", jax.devices()[0].platform, size, hypotheses, [1 / fps], fps=fps)
 
 

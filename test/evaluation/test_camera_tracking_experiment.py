@@ -86,11 +86,21 @@ class OffByAMillimetre:
 def test_a_row_tells_rate_and_errors_of_what_was_tracked(model, monkeypatch):
     monkeypatch.setattr(camera_tracking, "CameraTracker", OffByAMillimetre)
     monkeypatch.setitem(camera_tracking.OBJECTS, "mustard_bottle", "box")
-    row = camera_tracking.track_row(Library((model,)), "mustard_bottle", 25, "own", 512, 4)
+    recordings = camera_tracking.Recordings(Library((model,)), 4)
+    row = camera_tracking.track_row(recordings, "mustard_bottle", 25, "own", 512)
     assert (row["fps"], row["lost"], row["count"], row["hypotheses"]) == (20.0, 1, 3, 512)
     assert row["position_cm"] == row["position_cm_worst"] == pytest.approx(0.1, abs=1e-4)
     assert row["orientation_deg"] == pytest.approx(0.2, abs=1e-3)
     assert row["paper"] == {"fps": 103.2, "position_cm": 0.13, "orientation_deg": 1.524}
+
+
+def test_independent_frames_are_recorded_once(model, monkeypatch):
+    monkeypatch.setitem(camera_tracking.OBJECTS, "mustard_bottle", "box")
+    monkeypatch.setattr(camera_tracking, "ycb_mesh", lambda name: name)
+    monkeypatch.setattr(camera_tracking, "independent_frames", lambda mesh, poses, seed: iter([mesh, len(poses), seed]))
+    recordings = camera_tracking.Recordings(Library((model,)), 3)
+    first = recordings.frames("mustard_bottle", "independent", 25)
+    assert first == ["box", 3, 0] and recordings.frames("mustard_bottle", "independent", 50) is first
 
 
 def row(**changes):

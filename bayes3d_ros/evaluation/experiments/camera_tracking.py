@@ -5,13 +5,14 @@ Position and orientation are the camera's, in the object's frame. Frames a secon
 everything compiled.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -23,7 +24,8 @@ from bayes3d_ros.evaluation.plots import INK, colour
 from bayes3d_ros.inference.camera_tracking import CameraTracker
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import KnownWorld
-from bayes3d_ros.model.objects import Library, load_library
+from bayes3d_ros.model.objects import Library, ObjectModel, load_library
+from bayes3d_ros.model.observation import DepthFrame
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -80,21 +82,45 @@ def steps(quick: bool) -> Iterator[list[Row]]:
     """A row each: all frames tracked in turn."""
     with TemporaryDirectory(prefix="bayes3d-tracking-") as folder:
         library = load_library(ycb_library(tuple(OBJECTS.values()), Path(folder)))
+    recordings = Recordings(library, QUICK_FRAMES if quick else FRAMES)
     for case in _cases(quick):
-        yield [track_row(library, *case, QUICK_FRAMES if quick else FRAMES)]
+        yield [track_row(recordings, *case)]
 
 
-def track_row(library: Library, thing: str, size: int, frames: str, hypotheses: int, number: int) -> Row:
-    """Track the first `number` frames; the first one's pose is given, the errors are those of the others."""
-    name, seed = OBJECTS[thing], list(OBJECTS).index(thing)
-    model = library.models[library.names.index(name)]
-    poses = panning_cameras(model, number, seed)
-    if frames == "own":
-        recorded, settings = own_frames(model, poses, size), TrackerSettings(sigma_max=NOISELESS)
-    else:
-        recorded, settings = independent_frames(ycb_mesh(name), poses, seed), TrackerSettings()
-    tracker = CameraTracker(library, replace(settings, score_width=size, hypotheses=hypotheses))
-    known = tracker.start(KnownWorld((name,), np.eye(4)[None], table=False), poses[0])
+class Recordings:
+    """The first `number` frames of a camera that pans around an object. Those of the independent renderer serve every
+    size, and are kept."""
+
+    def __init__(self, library: Library, number: int) -> None:
+        self.library, self._number = library, number
+        self._kept: dict[str, list[DepthFrame]] = {}
+
+    def poses(self, thing: str) -> list[Float[np.ndarray, "4 4"]]:
+        """T_object_camera of every frame."""
+        return panning_cameras(self._model(thing), self._number, self._seed(thing))
+
+    def frames(self, thing: str, frames: str, size: int) -> Iterable[DepthFrame]:
+        """What it saw, of either kind; `size` is that of its own."""
+        if frames == "own":
+            return own_frames(self._model(thing), self.poses(thing), size)
+        if thing not in self._kept:
+            recorded = independent_frames(ycb_mesh(OBJECTS[thing]), self.poses(thing), self._seed(thing))
+            self._kept[thing] = list(recorded)
+        return self._kept[thing]
+
+    def _model(self, thing: str) -> ObjectModel:
+        return self.library.models[self.library.names.index(OBJECTS[thing])]
+
+    def _seed(self, thing: str) -> int:
+        return list(OBJECTS).index(thing)
+
+
+def track_row(recordings: Recordings, thing: str, size: int, frames: str, hypotheses: int) -> Row:
+    """Track what was recorded; the first frame's pose is given, the errors are those of the others."""
+    poses, recorded = recordings.poses(thing), recordings.frames(thing, frames, size)
+    settings = TrackerSettings(sigma_max=NOISELESS) if frames == "own" else TrackerSettings()
+    tracker = CameraTracker(recordings.library, replace(settings, score_width=size, hypotheses=hypotheses))
+    known = tracker.start(KnownWorld((OBJECTS[thing],), np.eye(4)[None], table=False), poses[0])
     seconds, position, orientation, lost = [], [], [], 0
     for k, frame in enumerate(recorded):
         if k == 0:
