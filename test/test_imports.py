@@ -1,6 +1,7 @@
 """Imports point one way, only ros/ knows ROS, and every import is declared."""
 
 import ast
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -93,3 +94,18 @@ def test_versions_agree() -> None:
     version = ElementTree.parse(REPOSITORY / "package.xml").findtext("version")
     assert version == bayes3d_ros.__version__
     assert f'version="{version}"' in (REPOSITORY / "setup.py").read_text()
+
+
+def test_no_import_starts_jax():
+    """Commands and nodes say what JAX's devices are after they have imported what they need, and before it computes."""
+    names = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in FILES]
+    without_ros = [name for name in names if not name.startswith("bayes3d_ros.ros") and "__init__" not in name]
+    program = f"""
+import importlib
+from jax._src import xla_bridge
+for name in {without_ros}:
+    importlib.import_module(name)
+    assert not xla_bridge.backends_are_initialized(), name
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr

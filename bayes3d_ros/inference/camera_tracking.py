@@ -40,7 +40,7 @@ _OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.p
 _ARM = 0.03  # metres, that they hold a turn by at least
 _FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
 _CANDIDATES = 64  # poses that a parsed scene may suggest
-_ROUGH = Noise(jnp.array([0.006]), jnp.array([0.1]))  # at which those are compared
+_ROUGH = Noise(np.float32([0.006]), np.float32([0.1]))  # at which those are compared; not JAX's: `every_core`
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write camera-tracking.png: errors and frames a second against the image's size, beside the paper's."""
-    figure = Figure(figsize=(12, 3.8), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(13.5, 3.8), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     titles = (
         ("position_cm", "mean position error, cm"),
@@ -213,7 +213,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         axis.set_xlabel("pixels across", color=INK)
         axis.set_title(title, loc="left", fontsize=10, color=INK)
         axis.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].legend(fontsize=6, frameon=False)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=7, frameon=False)
     path = folder / "camera-tracking.png"
     figure.savefig(path, dpi=110)
     return [path]
