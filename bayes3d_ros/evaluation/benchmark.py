@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import yaml
 
 import bayes3d_ros
 from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation.speed_rows import SpeedRow, speed_row
+from bayes3d_ros.evaluation.simulation import simulate
+from bayes3d_ros.evaluation.speed_rows import FILLED_TABLE, SpeedRow, speed_row
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.inference.compilation import cores, enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
@@ -29,6 +31,16 @@ TEN_TYPES: tuple[str, ...] = (
     "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "010_potted_meat_can",
     "011_banana", "019_pitcher_base", "024_bowl", "025_mug", "035_power_drill",
 )  # fmt: skip
+# Six objects that one table is filled with, one after the other: mesh, x and y in metres, yaw in degrees.
+FILLING: tuple[tuple[str, float, float, float], ...] = (
+    ("006_mustard_bottle", -0.19, 0.06, 20.0),
+    ("025_mug", 0.03, -0.06, -60.0),
+    ("003_cracker_box", 0.2, 0.12, -25.0),
+    ("010_potted_meat_can", -0.22, -0.14, 70.0),
+    ("024_bowl", 0.22, -0.14, 20.0),
+    ("005_tomato_soup_can", 0.0, 0.24, 0.0),
+)
+FILLED = (1, 2, 4, 6)
 REPEATS = 7
 MEMORY_FRAMES = 5, 50  # before which everything has happened once, and to which memory has to stay as it is
 HEADER = f"{'what':<12} {'bag':<18} {'library':>7} {'objects':>7} {'median s':>9} {'min':>8} {'max':>8}"
@@ -58,17 +70,28 @@ def cases() -> list[Case]:
     return [Case(bag, types) for bag, types in wanted if bag.exists()]
 
 
+def filled_tables(folder: Path) -> Iterator[Case]:
+    """One frame of the same table with more and more on it, simulated into new bags."""
+    for number in FILLED:
+        things = [{"mesh": mesh, "x": x, "y": y, "yaw": yaw} for mesh, x, y, yaw in FILLING[:number]]
+        camera = {"eye": [-0.06, -0.66, 0.5], "target": [0.0, 0.02, 0.04], "frames": 1}
+        table = {"size": [1.3, 0.9], "height": 0.74}
+        scene = folder / f"{FILLED_TABLE}_{number}.yaml"
+        scene.write_text(yaml.safe_dump({"seed": number, "camera": camera, "table": table, "objects": things}))
+        yield Case(simulate(scene, scene.with_suffix("")), TEN_TYPES)
+
+
 def count() -> int:
     """How many rows `rows` yields."""
-    return len(cases()) + 3
+    return len(cases()) + len(FILLED) + 3
 
 
 def rows() -> Iterator[SpeedRow]:
-    """Warm parsing of every case; the start of a process without and with its compiled code in the cache; what it takes
-    of memory."""
+    """Warm parsing of every case, and of a table that is filled; the start of a process without and with its compiled
+    code in the cache; what it takes of memory."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
         libraries = {types: ycb_library(types, Path(folder) / str(len(types))) for types in (ONE_TYPE, TEN_TYPES)}
-        for case in cases():
+        for case in (*cases(), *filled_tables(Path(folder))):
             yield parse_row(case, load_library(libraries[case.types]))
         start = Case(share_directory() / "bags" / "one_object", TEN_TYPES)
         for what in ("cold start", "warm start"):

@@ -7,6 +7,8 @@ import numpy as np
 
 SpeedRow = dict[str, Any]
 
+FILLED_TABLE = "table_of"  # bags of one table with more and more objects on it
+
 
 def speed_row(
     what: str, backend: str, device: str, size: int | str, hypotheses: int | None, seconds: Sequence[float], **more: Any
@@ -29,8 +31,8 @@ def speed_row(
 
 def growth(rows: Sequence[SpeedRow]) -> dict[str, float]:
     """How many times the cost of more of something is that of less, over how many times as much of it there is: at most
-    1 where cost grows linearly. Of hypotheses (ours, render+score, from 256 on), of objects on a table (bundled bags),
-    of the library's types; and how many times the memory of a few frames many take."""
+    1 where cost grows linearly. Of hypotheses (ours, render+score, from 256 on), of objects on one table, of the
+    library's types; and how many times the memory of a few frames many take."""
     told = {}
     scored = [r for r in rows if (r["what"], r["backend"]) == ("render+score", "ours") and r["hypotheses"] >= 256]
     for size in dict.fromkeys(r["size"] for r in scored):
@@ -38,11 +40,8 @@ def growth(rows: Sequence[SpeedRow]) -> dict[str, float]:
             name = f"seconds a hypothesis, {more['hypotheses']} / {less['hypotheses']}, {size} pixels"
             told[name] = _relative(less, more, "hypotheses")
     parsed = [r for r in rows if r["what"] == "parse"]
-    for library in dict.fromkeys(r["library"] for r in parsed):
-        bundled = [r for r in parsed if r["library"] == library and not r["bag"].startswith("real")]
-        for less, more in _neighbours(bundled, "objects"):
-            name = f"seconds an object, {more['objects']} / {less['objects']}, {library} types"
-            told[name] = _relative(less, more, "objects")
+    for less, more in _neighbours([r for r in parsed if r["bag"].startswith(FILLED_TABLE)], "objects"):
+        told[f"seconds an object, {more['objects']} / {less['objects']}"] = _relative(less, more, "objects")
     for bag in dict.fromkeys(r["bag"] for r in parsed):
         for less, more in _neighbours([r for r in parsed if r["bag"] == bag], "library"):
             name = f"seconds a type, {more['library']} / {less['library']}, {bag}"

@@ -40,7 +40,7 @@ _OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.p
 _ARM = 0.03  # metres, that they hold a turn by at least
 _FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
 _CANDIDATES = 64  # poses that a parsed scene may suggest
-_ROUGH = Noise(np.float32([0.006]), np.float32([0.1]))  # at which those are compared; not JAX's: `every_core`
+_ROUGH = 0.006, 0.1  # metres of sigma, and p_outlier, at which those are compared
 
 
 @dataclass(frozen=True)
@@ -161,11 +161,12 @@ class CameraTracker:
             raise TrackingError(f"expected one of {', '.join(sorted(set(known.world.types)))} in sight, found {seen}")
         image = self._image(frame, known.world, np.linalg.inv(suggested[0]))
         best, best_score = suggested[0], -np.inf
+        noise = Noise(*(jnp.float32([level]) for level in _ROUGH))
         for first in range(0, len(suggested), _CANDIDATES):
             some = suggested[first : first + _CANDIDATES]
             padded = np.linalg.inv(np.stack(some + some[:1] * (_CANDIDATES - len(some))))
             scores = log_likelihood_of_cameras(
-                jnp.asarray(padded, jnp.float32), known.scene.world, image, self._arrays, _ROUGH, self.settings.window
+                jnp.asarray(padded, jnp.float32), known.scene.world, image, self._arrays, noise, self.settings.window
             )
             value = np.asarray(scores)[: len(some), 0, 0]
             if value.max() > best_score:

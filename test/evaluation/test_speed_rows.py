@@ -29,13 +29,15 @@ def test_growth_is_one_where_cost_is_linear():
         parsed("one_object", 1, 1, 1.0),
         parsed("one_object", 10, 1, 2.0),
         parsed("three_objects", 10, 3, 12.0),
+        parsed("table_of_1", 10, 1, 2.0),
+        parsed("table_of_4", 10, 4, 6.0),
         parsed("real_clutter", 10, 5, 99.0),
         speed_row("memory", "ours", "cpu", "8x6", None, [1.0], **peaks),
     ]
     assert growth(rows) == {
         "seconds a hypothesis, 2048 / 256, 25 pixels": 1.0,
         "seconds a hypothesis, 16384 / 2048, 25 pixels": 0.5,
-        "seconds an object, 3 / 1, 10 types": 2.0,
+        "seconds an object, 4 / 1": 0.75,
         "seconds a type, 10 / 1, one_object": pytest.approx(0.2),
         "peak memory after 50 frames / after a few": 1.1,
     }
