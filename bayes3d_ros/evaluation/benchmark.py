@@ -77,7 +77,7 @@ def filled_tables(folder: Path) -> Iterator[Case]:
         camera = {"eye": [-0.06, -0.66, 0.5], "target": [0.0, 0.02, 0.04], "frames": 1}
         table = {"size": [1.3, 0.9], "height": 0.74}
         scene = folder / f"{FILLED_TABLE}_{number}.yaml"
-        scene.write_text(yaml.safe_dump({"seed": number, "camera": camera, "table": table, "objects": things}))
+        scene.write_text(yaml.safe_dump({"seed": 0, "camera": camera, "table": table, "objects": things}))
         yield Case(simulate(scene, scene.with_suffix("")), TEN_TYPES)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +14,7 @@ from bayes3d_ros.evaluation.resting import placed, rest_rotation
 from bayes3d_ros.evaluation.sensor_noise import SensorNoise
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.poses import look_at
+from bayes3d_ros.model.yaml_file import read_yaml
 
 _INTRINSICS = {"width": 640, "height": 480, "fx": 615.0, "fy": 615.0, "cx": 319.5, "cy": 239.5}
 
@@ -48,14 +48,7 @@ class Scene:
 
 def load_scene(path: Path) -> Scene:
     """Read a scene. Raises SimulationError, one line naming the file, the key and what was expected."""
-    try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise SimulationError(f"{path}: expected a readable scene file: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SimulationError(f"{path}: expected a scene file in yaml, this is no text") from None
-    except yaml.YAMLError as error:
-        raise SimulationError(f"{path}: expected yaml: {' '.join(str(error).split())}") from None
+    content = read_yaml(path, "scene file", SimulationError)
     try:
         return _scene(path, content)
     except ValueError as error:

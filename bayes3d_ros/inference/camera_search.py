@@ -7,6 +7,7 @@ tilts; what is left is the azimuth, and where on the table, near the optical axi
 target is taken to lie in the direction of the middle of the returns.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -21,15 +22,17 @@ from bayes3d_ros.inference.depth_alignment import Scene, aligned
 from bayes3d_ros.inference.table import find_plane, table_frame
 from bayes3d_ros.model.camera_score import log_likelihood_of_cameras
 from bayes3d_ros.model.image import Image, halved
-from bayes3d_ros.model.likelihood import IN_WORKSPACE, Noise
+from bayes3d_ros.model.likelihood import Noise
 from bayes3d_ros.model.motions import exp_about, product
+from bayes3d_ros.model.sharding import over_devices
 
 _DRAWS = 8192
-_ALIGNED = 96  # of them; places nearer to each other than APART, as a share of the distance, count as one
-_APART = 0.1
+_ALIGNED = 96  # of them
+_APART = (0.1, 0.3)  # share of the distance, and radians: two that are nearer in both count as one
 _REACHES = (0.05, 0.05, 0.05, 0.03, 0.03, 0.02, 0.015, 0.01, 0.006)  # metres, of alignment
 _SCALE = (0.1, 0.1, 0.1, 0.3, 0.3, 0.3)  # metres and radians that it may move a camera
-_BESIDE = 0.25  # metres that the target may be beside the table's origin, where the optical axis meets it
+_BESIDE = 0.25  # metres that the target may be beside the optical axis, over a table
+_LEVEL = 0.05  # sine of the angle below which a camera looks along the table, not at it
 _ROUGH, _FINE, _P_OUTLIER = 0.02, 0.006, 0.1  # metres of sigma, before and after
 _WIDEST = 64  # pixels across, at most, of the image that is looked at
 
@@ -43,59 +46,85 @@ class LookAt(NamedTuple):
     highest: float
 
     def draw(
-        self, count: int, target: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], seed: int
+        self, count: int, target: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "N 4 4"]:
         """T_world_camera of cameras that see the target in a direction of their own, evenly spread (a scrambled Sobol
         sequence: `count` is a power of two)."""
-        u = qmc.Sobol(3, seed=seed).random(count)
+        u = qmc.Sobol(3, seed=rng).random(count)
         distance = self.nearest + (self.farthest - self.nearest) * u[:, :1]
         altitude = self.lowest + (self.highest - self.lowest) * u[:, 1]
         T = look_at(target + distance * direction(2 * np.pi * u[:, 2], altitude), target)
-        T[:, :3, :3] = T[:, :3, :3] @ Rotation.align_vectors([0.0, 0.0, 1.0], towards)[0].as_matrix()
+        T[:, :3, :3] = T[:, :3, :3] @ _onto_the_axis(towards)
         return T
 
 
+def _onto_the_axis(towards: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The shortest rotation that takes a direction to z."""
+    axis = np.cross(towards, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis)
+    return Rotation.from_rotvec(axis * np.arctan2(sine, towards[2]) / max(sine, 1e-12)).as_matrix()
+
+
 def over_table(
-    T_camera_table: Float[np.ndarray, "4 4"], count: int, target: Float[np.ndarray, "3"], seed: int
+    T_camera_table: Float[np.ndarray, "4 4"], count: int, target: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "N 4 4"]:
-    """T_world_camera of cameras that see the table so, turned any way, and the target near the table's origin."""
-    u = qmc.Sobol(3, seed=seed).random(count)
+    """T_world_camera of cameras that see the table so, turned any way. The target is near where the optical axis is as
+    high as the target (or, where it never is, near the table's origin)."""
+    T_table_camera = np.linalg.inv(T_camera_table)
+    eye, axis = T_table_camera[:3, 3], T_table_camera[:3, 2]
+    seen = eye + axis * (target[2] - eye[2]) / axis[2] if axis[2] < -_LEVEL else np.zeros(3)
+    u = qmc.Sobol(3, seed=rng).random(count)
     T_world_table = np.tile(np.eye(4), (count, 1, 1))
     T_world_table[:, :3, :3] = Rotation.from_rotvec(np.outer(2 * np.pi * u[:, 0], [0, 0, 1])).as_matrix()
-    T_world_table[:, :2, 3] = target[:2] + _BESIDE * (2 * u[:, 1:] - 1)
-    return T_world_table @ np.linalg.inv(T_camera_table)
+    T_world_table[:, :2, 3] = target[:2] + _BESIDE * (2 * u[:, 1:] - 1) - (T_world_table[:, :3, :3] @ seen)[:, :2]
+    return T_world_table @ T_table_camera
 
 
-def find_camera(prior: LookAt, scene: Scene, image: Image, window: int, seed: int) -> Float[np.ndarray, "4 4"]:
-    """The likeliest T_world_camera that is found. Raises ParseError where a table that the world has is not seen."""
-    points = _returns(image)
+def find_camera(
+    prior: LookAt,
+    scene: Scene,
+    image: Image,
+    points: Float[np.ndarray, "P 3"],
+    window: int,
+    rng: np.random.Generator,
+    devices: tuple[jax.Device, ...] = (),
+) -> Float[np.ndarray, "4 4"]:
+    """The likeliest T_world_camera that is found; `points` are the frame's returns. Raises ParseError where a table
+    that the world has is not seen."""
     while image.depth.shape[1] > _WIDEST:
         image = halved(image)
-
-    def scores(T_camera_world: Float[Array, "N 4 4"], sigma: float) -> Float[np.ndarray, "N"]:
-        noise = Noise(jnp.float32([sigma]), jnp.float32([_P_OUTLIER]))
-        told = log_likelihood_of_cameras(T_camera_world, scene.world, image, scene.library, noise, window)
-        return np.asarray(told)[:, 0, 0]
-
     target = np.asarray(scene.pivot, np.float64)
     if scene.world.table:
-        T_world_camera = over_table(table_frame(find_plane(points), points), _DRAWS, target, seed)
+        T_world_camera = over_table(table_frame(find_plane(points), points), _DRAWS, target, rng)
     else:
-        T_world_camera = prior.draw(_DRAWS, target, points.mean(0), seed)
+        T_world_camera = prior.draw(_DRAWS, target, points.mean(0), rng)
     T_camera_world = jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32)
-    best = _best_apart(scores(T_camera_world, _ROUGH), T_world_camera[:, :3, 3] - target, _ALIGNED)
-    moved = _all_aligned(T_camera_world[best], image, scene)
-    return np.linalg.inv(np.asarray(moved[scores(moved, _FINE).argmax()], np.float64))
+    value = np.asarray(_scores(T_camera_world, image, scene, _ROUGH, window, devices))
+    best = _best_apart(value, T_world_camera, target, _ALIGNED)
+    moved = _all_aligned(T_camera_world[best], image, scene, devices)
+    value = np.asarray(_scores(moved, image, scene, _FINE, window, devices))
+    return np.linalg.inv(np.asarray(moved[value.argmax()], np.float64))
 
 
-def _returns(image: Image) -> Float[np.ndarray, "P 3"]:
-    depth, x, y, kind = (np.asarray(a) for a in (image.depth, image.ray_x, image.ray_y, image.kind))
-    return np.stack([depth * x, depth * y[:, None], depth], -1)[kind == IN_WORKSPACE]
+@partial(jax.jit, static_argnames=("sigma", "window", "devices"))
+def _scores(
+    T_camera_world: Float[Array, "N 4 4"],
+    image: Image,
+    scene: Scene,
+    sigma: float,
+    window: int,
+    devices: tuple[jax.Device, ...],
+) -> Float[Array, "N"]:
+    noise = Noise(jnp.float32([sigma]), jnp.float32([_P_OUTLIER]))
+    score = over_devices(partial(log_likelihood_of_cameras, window=window), devices)
+    return score(T_camera_world, scene.world, image, scene.library, noise)[:, 0, 0]
 
 
-@jax.jit
-def _all_aligned(T_camera_world: Float[Array, "N 4 4"], image: Image, scene: Scene) -> Float[Array, "N 4 4"]:
-    def one(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+@partial(jax.jit, static_argnames="devices")
+def _all_aligned(
+    T_camera_world: Float[Array, "N 4 4"], image: Image, scene: Scene, devices: tuple[jax.Device, ...]
+) -> Float[Array, "N 4 4"]:
+    def one(T: Float[Array, "4 4"], image: Image, scene: Scene) -> Float[Array, "4 4"]:
         centre = (T[:3, :3] * scene.pivot).sum(-1) + T[:3, 3]
 
         def pose(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
@@ -103,15 +132,26 @@ def _all_aligned(T_camera_world: Float[Array, "N 4 4"], image: Image, scene: Sce
 
         return pose(aligned(pose, jnp.zeros(6), image, scene, jnp.array(_SCALE), jnp.array(_REACHES)))
 
-    return jax.lax.map(one, T_camera_world)
+    def some(T: Float[Array, "M 4 4"], image: Image, scene: Scene) -> Float[Array, "M 4 4"]:
+        return jax.lax.map(lambda each: one(each, image, scene), T)
+
+    return over_devices(some, devices)(T_camera_world, image, scene)
 
 
-def _best_apart(value: Float[np.ndarray, "N"], place: Float[np.ndarray, "N 3"], count: int) -> Int[np.ndarray, "count"]:
+def _best_apart(
+    value: Float[np.ndarray, "N"],
+    T_world_camera: Float[np.ndarray, "N 4 4"],
+    target: Float[np.ndarray, "3"],
+    count: int,
+) -> Int[np.ndarray, "count"]:
     """The best, from the best on, that are not nearly one of these; the same again where there are too few."""
-    reach = _APART * np.linalg.norm(place, axis=1)
+    place, turn = T_world_camera[:, :3, 3], T_world_camera[:, :3, :3]
+    reach = _APART[0] * np.linalg.norm(place - target, axis=1)
+    alike = 2 * np.sqrt(2) * np.sin(_APART[1] / 2)  # the distance between two rotations, as matrices, at that angle
     kept: list[int] = []
     for k in np.argsort(-value):
-        if not kept or (np.linalg.norm(place[k] - place[kept], axis=1) >= reach[kept]).all():
+        near = np.linalg.norm(place[k] - place[kept], axis=1) < reach[kept]
+        if not (near & (np.linalg.norm(turn[k] - turn[kept], axis=(1, 2)) < alike)).any():
             kept.append(int(k))
             if len(kept) == count:
                 break

@@ -39,6 +39,7 @@ _STEEP = 5.0  # slope of depth against a shift, from which it is an outline's an
 _OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.py`)
 _ARM = 0.03  # metres, that they hold a turn by at least
 _FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
+_PLANE_WIDTH = 160  # pixels across, of the image that the table is found in
 _CANDIDATES = 64  # poses that a parsed scene may suggest
 _ROUGH = 0.006, 0.1  # metres of sigma, and p_outlier, at which those are compared
 
@@ -181,7 +182,10 @@ class CameraTracker:
             settings.nearest_camera, settings.farthest_camera, settings.lowest_camera, settings.highest_camera
         )
         image = self._image(frame, known.world, None)
-        found = find_camera(prior, known.scene, image, settings.window, settings.seed)
+        camera, depth, _, returned = reduced(frame, _PLANE_WIDTH, settings.near, settings.far)
+        points = unproject(np.where(returned, depth, np.nan), camera)[returned]
+        rng = np.random.default_rng([settings.seed, frame.stamp_ns])
+        found = find_camera(prior, known.scene, image, points, settings.window, rng, self._devices)
         return replace(known, particles=self._at_rest(found), stamp_ns=None, frame_time=0.0)
 
     def _spheres(self, world: KnownWorld) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
@@ -250,7 +254,7 @@ class CameraFollower:
         """One frame, the first one where nothing is known yet. Raises TrackingError or ParseError, and then what was
         known still is."""
         if known is None:
-            return self._found(self._first(frame), frame)
+            return self._first(frame)
         longest = self.tracker.settings.longest_gap
         late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > longest
         if not late:
@@ -258,22 +262,28 @@ class CameraFollower:
             if not estimate.lost:
                 return now, estimate
         try:
-            found = self.tracker.relocalise(known, self.parser.parse(frame), frame)
+            now, estimate = self.tracker.step(self.tracker.relocalise(known, self.parser.parse(frame), frame), frame)
         except (TrackingError, ParseError):
             if self._told is None:
                 raise
-            found = self.tracker.look_for(known, frame)
-        return self._found(found, frame)
+            return self._looked_for(known, frame)
+        if estimate.lost and self._told is not None:
+            return self._looked_for(known, frame)
+        return now, replace(estimate, found_again=True)
 
-    def _first(self, frame: DepthFrame) -> Tracking:
+    def _first(self, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         if self._told is None:
-            return self.tracker.start(*world_of(self.parser.parse(frame), self.tracker.settings.table))
+            world, T_world_camera = world_of(self.parser.parse(frame), self.tracker.settings.table)
+            now, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
+            return now, replace(estimate, found_again=True)
         if frame.T_table_camera is not None:
-            return self.tracker.start(self._told.world, frame.T_table_camera)
-        return self.tracker.look_for(self._told, frame)
+            now, estimate = self.tracker.step(self.tracker.start(self._told.world, frame.T_table_camera), frame)
+            if not estimate.lost:
+                return now, estimate
+        return self._looked_for(self._told, frame)
 
-    def _found(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
-        now, estimate = self.tracker.step(known, frame)
+    def _looked_for(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        now, estimate = self.tracker.step(self.tracker.look_for(known, frame), frame)
         return now, replace(estimate, found_again=True)
 
 

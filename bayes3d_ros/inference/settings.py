@@ -162,14 +162,14 @@ class TrackerSettings:
     )
     nearest_camera: float = setting(
         0.3,
-        "where only a known world tells of the camera: how near it may be to the objects",
+        "how near to the objects a camera is looked for in a known world without a table",
         unit="m",
         low=0.05,
         high=100.0,
     )
-    farthest_camera: float = setting(1.5, "and how far from them", unit="m", low=0.05, high=100.0)
-    lowest_camera: float = setting(0.2, "how low it may look down at them", unit="rad", low=-1.5, high=1.5)
-    highest_camera: float = setting(1.4, "and how steeply", unit="rad", low=-1.5, high=1.5)
+    farthest_camera: float = setting(1.5, "how far from them it is looked for there", unit="m", low=0.05, high=100.0)
+    lowest_camera: float = setting(0.2, "how low it may look down at them there", unit="rad", low=-1.5, high=1.5)
+    highest_camera: float = setting(1.4, "how steeply it may look down at them there", unit="rad", low=-1.5, high=1.5)
     least_explained: float = setting(
         0.5, "share of the objects' pixels that have to be explained, or the camera is lost", low=0.0, high=1.0
     )

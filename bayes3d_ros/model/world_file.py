@@ -5,27 +5,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.model.camera_estimate import KnownWorld, WorldError
 from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.yaml_file import read_yaml
 
+_FAR = 1e6  # metres
 _KEYS = ("type", "position", "orientation")
 
 
 def load_world(path: Path, table: bool, library: Library) -> KnownWorld:
     """Read `objects`: a list of type (of the library), position (metres) and orientation (x y z w), in the frame of the
     world. Raises WorldError, one line naming the file, the key and what was expected."""
-    try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise WorldError(f"{path}: expected a readable world file: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise WorldError(f"{path}: expected a world file in yaml, this is no text") from None
-    except yaml.YAMLError as error:
-        raise WorldError(f"{path}: expected yaml: {' '.join(str(error).split())}") from None
+    content = read_yaml(path, "world file", WorldError)
     try:
         return _world(content, table, library.names)
     except ValueError as error:
@@ -55,9 +49,10 @@ def _world(content: Any, table: bool, names: Sequence[str]) -> KnownWorld:
 
 def _numbers(value: Any, key: str, count: int) -> Float[np.ndarray, "n"]:
     try:
-        numbers = np.array(value, float)
-    except (TypeError, ValueError):
-        numbers = np.array([np.nan])
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        # Text too: PyYAML takes 1e-3 for some.
+        numbers = [np.nan if isinstance(v, bool) else float(v) for v in value]
+    except (TypeError, ValueError, OverflowError):
+        numbers = []
+    if len(numbers) != count or not np.all(np.abs(numbers) < _FAR):
         raise ValueError(f"{key}: expected {count} numbers, got {value!r}")
-    return numbers
+    return np.array(numbers)

@@ -70,7 +70,7 @@ class CameraTrackerNode(Node):
         self._settings = SettingsParameters(self, CAMERA_TRACKER_SETTINGS)
         self._session: _Session | None = None
         self._known: Tracking | None = None  # the worker's own
-        self._refusal, self._since = "", time.monotonic()
+        self._refusal, self._told, self._since = "", "", time.monotonic()
         self._path: deque[PoseStamped] = deque(maxlen=self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", _RELIABLE)
         self._particles = self.create_publisher(PoseArray, "~/particles", _RELIABLE)
@@ -113,13 +113,15 @@ class CameraTrackerNode(Node):
             self.get_logger().error(f"{error}; correct it, then call ~/reset")
             return str(error)
         self._refusal, self._since = "", time.monotonic()
+        self._told = "the next frame shows the world"
+        if world is not None:
+            self._told = f"the world is {len(world.types)} known object{'s' * (len(world.types) != 1)}"
 
         def job() -> None:
             self._known, self._session = None, None
             self._path.clear()
             self._session = _Session(self._make(library, settings, world), jax.default_backend())
-            told = "the next frame shows the world" if world is None else f"{len(world.types)} known objects"
-            self.get_logger().info(f"{told}; inference on {self._session.backend}")
+            self.get_logger().info(f"{self._told}; inference on {self._session.backend}")
 
         self._worker.call(job)
         return ""
@@ -128,7 +130,7 @@ class CameraTrackerNode(Node):
         """Load the library, forget the world and the camera."""
         problem = self._begin()
         response.success = not problem
-        response.message = problem or "the next frame shows the world"
+        response.message = problem or self._told
         return response
 
     # Frames

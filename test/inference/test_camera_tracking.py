@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.inference import camera_tracking, pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
 from bayes3d_ros.inference.camera_search import LookAt, over_table
@@ -149,12 +150,20 @@ def test_in_a_known_world_a_recorded_pose_is_where_tracking_starts(tracker, worl
     there = looking(0.4)
     monkeypatch.setattr(tracker, "look_for", None)
     _, estimate = CameraFollower(tracker, None, world).step(None, replace(frame(0, there), T_table_camera=there))
-    assert not estimate.lost and np.abs(off(estimate, there)[:3]).max() < 0.006
+    assert not estimate.lost and not estimate.found_again and np.abs(off(estimate, there)[:3]).max() < 0.006
 
 
-def test_a_lost_camera_is_looked_for_where_parsing_finds_nothing(tracker, world, frame):
+def test_in_a_known_world_a_wrong_recorded_pose_does_no_harm(tracker, world, frame):
+    there, wrong = looking(0.4), looking(0.4, 1.4)
+    _, estimate = CameraFollower(tracker, None, world).step(None, replace(frame(0, there), T_table_camera=wrong))
+    assert not estimate.lost and estimate.found_again and np.abs(off(estimate, there)[:3]).max() < 0.006
+
+
+@pytest.mark.parametrize("told", ["nothing", "wrong"])
+def test_a_lost_camera_is_looked_for_where_parsing_does_not_help(tracker, world, frame, told):
     def parse(seen):
-        return SimpleNamespace(objects=(), T_camera_table=np.eye(4))
+        nothing = SimpleNamespace(objects=(), T_camera_table=np.eye(4))
+        return nothing if told == "nothing" else parsed(world, looking(0.4, 1.4), seen)
 
     here, there = looking(0.4), looking(3.6)
     follower = CameraFollower(tracker, SimpleNamespace(parse=parse), world)
@@ -162,14 +171,18 @@ def test_a_lost_camera_is_looked_for_where_parsing_finds_nothing(tracker, world,
     known, estimate = follower.step(known, frame(1, there))
     assert estimate.found_again and not estimate.lost
     assert np.abs(off(estimate, there)[:3]).max() < 0.006
-    with pytest.raises(TrackingError, match="found no object"):  # where the world is what a frame showed
-        CameraFollower(tracker, SimpleNamespace(parse=parse)).step(known, frame(100, there))
+    alone = CameraFollower(tracker, SimpleNamespace(parse=parse))  # the world is what a frame showed
+    if told == "nothing":
+        with pytest.raises(TrackingError, match="found no object"):
+            alone.step(known, frame(100, there))
+    else:
+        assert alone.step(known, frame(100, there))[1].lost
 
 
 def test_draws_of_the_look_at_prior():
     """Within its intervals, evenly spread, upright; the target where it is to be seen."""
     target, ahead = np.array([0.1, -0.2, 0.05]), np.array([0.0, 0.0, 1.0])
-    T = LookAt(0.4, 1.2, 0.3, 1.1).draw(4096, target, ahead, 0)
+    T = LookAt(0.4, 1.2, 0.3, 1.1).draw(4096, target, ahead, np.random.default_rng(0))
     away = T[:, :3, 3] - target
     distance = np.linalg.norm(away, axis=1)
     values = {
@@ -182,18 +195,21 @@ def test_draws_of_the_look_at_prior():
     np.testing.assert_allclose(T[:, :3, 2], -away / distance[:, None], atol=1e-12)
     np.testing.assert_allclose(T[:, 2, 0], 0, atol=1e-12)
     assert (T[:, 2, 1] < 0).all()  # the image's y points down
-    aside = LookAt(0.4, 1.2, 0.3, 1.1).draw(64, target, np.array([0.2, -0.1, 1.0]), 0)
+    aside = LookAt(0.4, 1.2, 0.3, 1.1).draw(64, target, np.array([0.2, -0.1, 1.0]), np.random.default_rng(0))
     seen = np.linalg.inv(aside) @ np.append(target, 1.0)
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:3], np.tile([0.2, -0.1], (64, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(aside[:, :3, :3]), 1)
 
 
-def test_draws_over_a_table_see_it_as_it_was_seen():
-    T_world_camera, target = looking(0.7), np.array([0.05, 0.1, 0.08])
-    T_camera_table = np.linalg.inv(T_world_camera)  # the world's own: its z = 0
-    T = over_table(T_camera_table, 1024, target, 0)
-    np.testing.assert_allclose((T @ T_camera_table)[:, 2], np.tile([0.0, 0.0, 1.0, 0.0], (1024, 1)), atol=1e-12)
-    turn, place = (T @ T_camera_table)[:, :2, 0], (T @ T_camera_table)[:, :2, 3] - target[:2]
+@pytest.mark.parametrize("altitude", [0.25, 0.64, 1.2])
+def test_draws_over_a_table_see_it_as_it_was_seen(altitude):
+    """And the target within a quarter of a metre of where the optical axis is as high, however low the camera is."""
+    target, height = np.array([0.05, 0.1, 0.12]), np.array([0.0, 0.0, 0.12])
+    T_table_camera = look_at(height + 0.6 * direction(0.7, altitude), height)
+    T = over_table(np.linalg.inv(T_table_camera), 1024, target, np.random.default_rng(0))
+    T_world_table = T @ np.linalg.inv(T_table_camera)
+    np.testing.assert_allclose(T_world_table[:, 2], np.tile([0.0, 0.0, 1.0, 0.0], (1024, 1)), atol=1e-12)
+    turn, place = T_world_table[:, :2, 0], (T_world_table @ np.append(height, 1.0))[:, :2] - target[:2]
     assert kstest(np.arctan2(*turn.T), "uniform", (-np.pi, 2 * np.pi)).statistic < 0.01
     assert np.abs(place).max() < 0.25 and np.abs(place).max(0).min() > 0.24
 
@@ -210,6 +226,7 @@ def test_a_camera_is_looked_for_without_a_table(tracker, world):
     known = tracker.look_for(tracker.start(alone, np.eye(4)), DepthFrame(depth, CAMERA, 10**9, "camera"))
     found = np.linalg.inv(np.asarray(known.particles.T_camera_world[0], float))
     assert np.abs(found[:3, 3] - there[:3, 3]).max() < 0.03
+    assert Rotation.from_matrix(found[:3, :3].T @ there[:3, :3]).magnitude() < 0.06
 
 
 def test_what_cannot_be_tracked_is_refused_in_a_line(tracker, world, frame):

@@ -32,6 +32,13 @@ def test_a_world_is_read(tmp_path):
         (f"objects: [{MUG.replace('mug', '7')}]", r"objects\[0\].type: expected an object of the library, it has no 7"),
         (f"objects: [{MUG.replace('-0.2, ', '')}]", r"objects\[0\].position: expected 3 numbers, got \[0.1, 0.03\]"),
         (f"objects: [{MUG.replace('0.1', '.nan')}]", r"objects\[0\].position: expected 3 numbers"),
+        (f"objects: [{MUG.replace('0.1', 'true')}]", r"objects\[0\].position: expected 3 numbers"),
+        (f"objects: [{MUG.replace('0.1', '1' * 400)}]", r"objects\[0\].position: expected 3 numbers"),
+        (f"objects: [{MUG.replace('0.1', '1.0e+30')}]", r"objects\[0\].position: expected 3 numbers"),
+        (f"objects: [{MUG.replace('[0.1, -0.2, 0.03]', '7')}]", r"objects\[0\].position: expected 3 numbers, got 7"),
+        ("objects: 2020-13-45", "expected yaml: month must be"),
+        ("objects: !!int ''", "expected yaml"),
+        ("[" * 3000, "expected yaml"),
         (f"objects: [{MUG}, {MUG.replace('1, 0]', '2, 0]')}]", r"objects\[1\].orientation: expected a quaternion"),
     ],
 )

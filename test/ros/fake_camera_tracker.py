@@ -12,17 +12,18 @@ from bayes3d_ros.ros.spinning import run
 
 
 class FakeFollower:
-    """The camera stands as high above the world as the first return is far."""
+    """The camera stands as high above the world as the first return is far, and as far along y as the first known
+    object."""
 
     def __init__(self, library, settings, world):
-        pass
+        self.y = 0.0 if world is None else world.T_world_object[0, 1, 3]
 
     def step(self, known, frame):
         depth = frame.depth[np.isfinite(frame.depth)]
         if not depth.size:
             raise TrackingError("the depth image has no return")
         T = np.diag([1.0, -1.0, -1.0, 1.0])
-        T[2, 3] = depth[0]
+        T[1:3, 3] = self.y, depth[0]
         particles = np.repeat(T[None], 4, 0)
         particles[:, 0, 3] = np.arange(4)
         estimate = CameraEstimate(

@@ -78,6 +78,17 @@ def test_a_lost_camera_has_no_pose_and_says_why(rig):
     rig.ros.wait_for(lambda: rig.paths[-1].poses and len(rig.paths[-1].poses) == 1, "a path that begins anew")
 
 
+def test_a_known_world_goes_to_the_tracker(rig, library_folder, tmp_path):
+    name = next(library_folder.glob("*.npz")).stem
+    file = tmp_path / "world.yaml"
+    file.write_text(f"objects: [{{type: {name}, position: [0, 0.7, 0], orientation: [0, 0, 0, 1]}}]")
+    rig.start(world=file)
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose")
+    assert rig.poses[0].pose.pose.position.y == pytest.approx(0.7)
+    assert rig.ros.call(Trigger, "/camera_tracker/reset", Trigger.Request()).message == "the world is 1 known object"
+
+
 @pytest.mark.parametrize(
     "parameters, said",
     [
