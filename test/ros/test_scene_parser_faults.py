@@ -60,7 +60,6 @@ class Bench:
         assert "\n" not in report.status[0].message
         assert len(self.poses) == count
 
-
     def send_until(self, done, what: str) -> None:
         """One frame after the other: where the node subscribes anew, what comes before it is heard is lost."""
 
@@ -71,8 +70,15 @@ class Bench:
         self.ros.wait_for(sent, what, pause=0.2)
 
     def frames_are_refused(self, why: str) -> None:
+        count = len(self.poses)
         del self.diagnostics[:]
-        self.send_until(lambda: any(why in d.status[0].message for d in self.diagnostics), f"the diagnosis {why!r}")
+
+        def told() -> list[str]:
+            return [m for d in self.diagnostics if why in (m := d.status[0].message)]
+
+        self.send_until(told, f"the diagnosis {why!r}")
+        assert "\n" not in told()[0]
+        assert len(self.poses) == count
 
     def frames_are_parsed(self) -> None:
         count = len(self.poses)
