@@ -21,7 +21,7 @@ from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.inference.depth_alignment import Scene, aligned
 from bayes3d_ros.inference.table import find_plane, table_frame
 from bayes3d_ros.model.camera_score import log_likelihood_of_cameras
-from bayes3d_ros.model.image import Image, halved
+from bayes3d_ros.model.image import Image, at_most
 from bayes3d_ros.model.likelihood import Noise
 from bayes3d_ros.model.motions import exp_about, product
 from bayes3d_ros.model.sharding import over_devices
@@ -34,6 +34,7 @@ _SCALE = (0.1, 0.1, 0.1, 0.3, 0.3, 0.3)  # metres and radians that it may move a
 _BESIDE = 0.25  # metres that the target may be beside the optical axis, over a table
 _LEVEL = 0.05  # sine of the angle below which a camera looks along the table, not at it
 _ROUGH, _FINE, _P_OUTLIER = 0.02, 0.006, 0.1  # metres of sigma, before and after
+_AT_A_TIME = 64  # cameras that somebody suggests
 _WIDEST = 64  # pixels across, at most, of the image that is looked at
 
 
@@ -91,8 +92,7 @@ def find_camera(
 ) -> Float[np.ndarray, "4 4"]:
     """The likeliest T_world_camera that is found; `points` are the frame's returns. Raises ParseError where a table
     that the world has is not seen."""
-    while image.depth.shape[1] > _WIDEST:
-        image = halved(image)
+    image = at_most(image, _WIDEST)
     target = np.asarray(scene.pivot, np.float64)
     if scene.world.table:
         T_world_camera = over_table(table_frame(find_plane(points), points), _DRAWS, target, rng)
@@ -104,6 +104,22 @@ def find_camera(
     moved = _all_aligned(T_camera_world[best], image, scene, devices)
     value = np.asarray(_scores(moved, image, scene, _FINE, window, devices))
     return np.linalg.inv(np.asarray(moved[value.argmax()], np.float64))
+
+
+def likeliest(
+    T_world_camera: Float[np.ndarray, "N 4 4"],
+    scene: Scene,
+    image: Image,
+    window: int,
+    devices: tuple[jax.Device, ...] = (),
+) -> Float[np.ndarray, "4 4"]:
+    """The first of the likeliest of any number of cameras: scored so many at a time that nothing is compiled anew."""
+    T_camera_world, value = np.linalg.inv(T_world_camera), []
+    for first in range(0, len(T_camera_world), _AT_A_TIME):
+        some = T_camera_world[first : first + _AT_A_TIME]
+        padded = jnp.asarray(np.resize(some, (_AT_A_TIME, 4, 4)), jnp.float32)
+        value.append(np.asarray(_scores(padded, image, scene, _FINE, window, devices))[: len(some)])
+    return T_world_camera[np.concatenate(value).argmax()]
 
 
 @partial(jax.jit, static_argnames=("sigma", "window", "devices"))
@@ -124,18 +140,19 @@ def _scores(
 def _all_aligned(
     T_camera_world: Float[Array, "N 4 4"], image: Image, scene: Scene, devices: tuple[jax.Device, ...]
 ) -> Float[Array, "N 4 4"]:
-    def one(T: Float[Array, "4 4"], image: Image, scene: Scene) -> Float[Array, "4 4"]:
-        centre = (T[:3, :3] * scene.pivot).sum(-1) + T[:3, 3]
-
-        def pose(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
-            return product(exp_about(tangent, centre), T)
-
-        return pose(aligned(pose, jnp.zeros(6), image, scene, jnp.array(_SCALE), jnp.array(_REACHES)))
-
     def some(T: Float[Array, "M 4 4"], image: Image, scene: Scene) -> Float[Array, "M 4 4"]:
-        return jax.lax.map(lambda each: one(each, image, scene), T)
+        return jax.lax.map(lambda each: _aligned(each, image, scene), T)
 
     return over_devices(some, devices)(T_camera_world, image, scene)
+
+
+def _aligned(T_camera_world: Float[Array, "4 4"], image: Image, scene: Scene) -> Float[Array, "4 4"]:
+    centre = scene.pivot_seen(T_camera_world)
+
+    def pose(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
+        return product(exp_about(tangent, centre), T_camera_world)
+
+    return pose(aligned(pose, jnp.zeros(6), image, scene, jnp.array(_SCALE), jnp.array(_REACHES)))
 
 
 def _best_apart(

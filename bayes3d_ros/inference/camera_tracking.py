@@ -13,17 +13,17 @@ from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.inference import pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
-from bayes3d_ros.inference.camera_search import LookAt, find_camera
+from bayes3d_ros.inference.camera_search import LookAt, find_camera, likeliest
 from bayes3d_ros.inference.depth_alignment import Scene, rendered_slopes
 from bayes3d_ros.inference.noise import for_returns, noise_grid
 from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.scene_parsing import SceneParser, frame_key
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
-from bayes3d_ros.model.camera_score import World, log_likelihood_of_cameras, render_cameras
+from bayes3d_ros.model.camera_score import World, render_cameras
 from bayes3d_ros.model.image import Image
 from bayes3d_ros.model.library_arrays import library_arrays
-from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.model.motions import exp_about, inverse, log_about, product, quaternions
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced
@@ -40,8 +40,6 @@ _OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `registration.p
 _ARM = 0.03  # metres, that they hold a turn by at least
 _FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
 _PLANE_WIDTH = 160  # pixels across, of the image that the table is found in
-_CANDIDATES = 64  # poses that a parsed scene may suggest
-_ROUGH = 0.006, 0.1  # metres of sigma, and p_outlier, at which those are compared
 
 
 @dataclass(frozen=True)
@@ -161,18 +159,8 @@ class CameraTracker:
             seen = ", ".join(o.type for o in posterior.objects) or "no object"
             raise TrackingError(f"expected one of {', '.join(sorted(set(known.world.types)))} in sight, found {seen}")
         image = self._image(frame, known.world, np.linalg.inv(suggested[0]))
-        best, best_score = suggested[0], -np.inf
-        noise = Noise(*(jnp.float32([level]) for level in _ROUGH))
-        for first in range(0, len(suggested), _CANDIDATES):
-            some = suggested[first : first + _CANDIDATES]
-            padded = np.linalg.inv(np.stack(some + some[:1] * (_CANDIDATES - len(some))))
-            scores = log_likelihood_of_cameras(
-                jnp.asarray(padded, jnp.float32), known.scene.world, image, self._arrays, noise, self.settings.window
-            )
-            value = np.asarray(scores)[: len(some), 0, 0]
-            if value.max() > best_score:
-                best, best_score = some[int(value.argmax())], float(value.max())
-        return replace(known, particles=self._at_rest(best), stamp_ns=None, frame_time=0.0)
+        found = likeliest(np.stack(suggested), known.scene, image, self.settings.window, self._devices)
+        return self._begun_anew(known, found)
 
     def look_for(self, known: Tracking, frame: DepthFrame) -> Tracking:
         """The camera where only a frame tells of it: by the paper's look-at prior, about the middle of the objects.
@@ -186,7 +174,10 @@ class CameraTracker:
         points = unproject(np.where(returned, depth, np.nan), camera)[returned]
         rng = np.random.default_rng([settings.seed, frame.stamp_ns])
         found = find_camera(prior, known.scene, image, points, settings.window, rng, self._devices)
-        return replace(known, particles=self._at_rest(found), stamp_ns=None, frame_time=0.0)
+        return self._begun_anew(known, found)
+
+    def _begun_anew(self, known: Tracking, T_world_camera: Float[np.ndarray, "4 4"]) -> Tracking:
+        return replace(known, particles=self._at_rest(T_world_camera), stamp_ns=None, frame_time=0.0)
 
     def _spheres(self, world: KnownWorld) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
         """Middles, in the world, and radii of what encloses the objects' boxes."""
@@ -316,7 +307,7 @@ def _smooth_covariance(
 ) -> tuple[Float[Array, "6 6"], Float[Array, ""], Float[Array, ""]]:
     """What smooth errors add to the covariance of (shift, turn) about the pivot, on the camera's axes; the share of the
     objects' pixels that are explained, and how many there are."""
-    pivot = (T_camera_world[:3, :3] * scene.pivot).sum(-1) + T_camera_world[:3, 3]
+    pivot = scene.pivot_seen(T_camera_world)
 
     def pose(tangent: Array) -> Array:
         return product(exp_about(tangent, pivot), T_camera_world)

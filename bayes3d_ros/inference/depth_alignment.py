@@ -24,6 +24,10 @@ class Scene(NamedTuple):
     library: LibraryArrays
     pivot: Float[Array, "3"]  # of the world: motions are described about it, where shift and turn do not mix
 
+    def pivot_seen(self, T_camera_world: Float[Array, "4 4"]) -> Float[Array, "3"]:
+        """The pivot in a camera."""
+        return (T_camera_world[:3, :3] * self.pivot).sum(-1) + T_camera_world[:3, 3]
+
 
 def aligned(
     pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]],

@@ -27,7 +27,7 @@ from bayes3d_ros.inference.depth_alignment import RENDERED, Scene, aligned, info
 from bayes3d_ros.inference.noise import NoiseGrid
 from bayes3d_ros.inference.resampling import effective_fraction, normalised, systematic
 from bayes3d_ros.model.camera_score import log_likelihood_of_cameras
-from bayes3d_ros.model.image import Image, halved
+from bayes3d_ros.model.image import Image, at_most
 from bayes3d_ros.model.likelihood import Noise
 from bayes3d_ros.model.motions import exp_about, inverse, log_about, log_volume, product, rigid
 from bayes3d_ros.model.sharding import over_devices
@@ -256,16 +256,13 @@ def _search(
     p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
     blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]
     best = expected_pose(state)
-    centre = (best[:3, :3] * scene.pivot).sum(-1) + best[:3, 3]
     scale = _scales(motion)
-    chart = _Chart(best, centre, jnp.zeros(6), jnp.diag(scale))
+    chart = _Chart(best, scene.pivot_seen(best), jnp.zeros(6), jnp.diag(scale))
     draw_key, pick_key = jax.random.split(jax.random.fold_in(key, 0))
     index = jax.random.randint(pick_key, (each,), 0, len(expected))
     tried = product(exp_about(_draw_t(draw_key, each) * scale, jnp.zeros(3)), expected[index]).at[0].set(best)
     _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
-    coarse = image
-    while coarse.depth.shape[1] > _ALIGNED:
-        coarse = halved(coarse)
+    coarse = at_most(image, _ALIGNED)
     align = over_devices(_all_aligned, devices)
     means, scales = align(chart.tangent(tried[starts]), chart, coarse, scene, scale, state.sigma)
     pick = jnp.argmax(score(chart.pose(means), blurs[1])[:, 0, 0])

@@ -49,6 +49,13 @@ def halved(image: Image) -> Image:
     )
 
 
+def at_most(image: Image, width: int) -> Image:
+    """The image halved until it is no wider than so many pixels."""
+    while image.depth.shape[1] > width:
+        image = halved(image)
+    return image
+
+
 def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
     """The observed pixels of tiles of a shape; those that stick out of the image have no return."""
     height, width = image.depth.shape

@@ -50,14 +50,7 @@ def world():
 
 def looking(azimuth, distance=0.45):
     """T_world_camera of a camera that looks down at the world's origin."""
-    eye = distance * np.array([np.cos(azimuth) * 0.8, np.sin(azimuth) * 0.8, 0.6])
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0, 0, 1])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    T[:3, 3] = eye
-    return T
+    return look_at(distance * np.array([np.cos(azimuth) * 0.8, np.sin(azimuth) * 0.8, 0.6]), np.zeros(3))
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import trimesh
 from scipy.stats import multivariate_t
 
 from bayes3d_ros.evaluation.agreement import ratio_and_error
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.inference import pose_filter as tracking
 from bayes3d_ros.inference.noise import for_returns, log_marginal, noise_grid
 from bayes3d_ros.model import motions
@@ -36,13 +37,7 @@ def scene():
 def looking(azimuth, distance=0.5):
     """T_camera_world of a camera that looks down at the world's origin."""
     eye = distance * np.array([np.cos(azimuth) * 0.8, np.sin(azimuth) * 0.8, 0.6])
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0, 0, 1])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = [x, np.cross(z, x), z]
-    T[:3, 3] = -T[:3, :3] @ eye
-    return T
+    return np.linalg.inv(look_at(eye, np.zeros(3)))
 
 
 _render = jax.jit(depth_along)
