@@ -7,14 +7,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.ndimage import distance_transform_cdt
 
+from bayes3d_ros.model.empty_boxes import empty_boxes
 from bayes3d_ros.model.lookalikes import lookalikes
 from bayes3d_ros.model.objects import Library, ObjectModel
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
 SKETCH_POINTS = 96  # surface points a type, for the coarse score
+EMPTY = -127 << 24  # words below are those of empty voxels
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
 _TYPE_PAD, _VOXEL_PAD = 4, 1 << 16
 
@@ -22,8 +23,9 @@ _TYPE_PAD, _VOXEL_PAD = 4, 1 << 16
 class LibraryArrays(NamedTuple):
     """K types (padded), V voxels of all grids laid end to end.
 
-    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8) and offset (int8); an empty voxel
-    holds zeros and the Chebyshev distance in voxels to the nearest surface voxel; one inside the solid is all zeros.
+    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8, -127 the least) and offset (int8); an
+    empty voxel holds -128 and the sides of the empty box ahead (`empty_boxes.py`); one inside the solid is all zeros.
+    Every grid is there eight times, once for each octant of directions.
     """
 
     num_types: Int[Array, ""]
@@ -67,17 +69,18 @@ def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
     return model.box_size[[(axis + 1) % 3, (axis + 2) % 3]]
 
 
-def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "V"]:
+def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
     """The model's grid as 32-bit words (see LibraryArrays)."""
-    surface = np.zeros(model.occupancy.shape, bool)
-    surface[tuple(model.surface_index.T)] = True
-    distance = np.minimum(distance_transform_cdt(~surface, "chessboard"), 255)
-    words = np.where(model.occupancy & ~surface, 0, distance).astype(np.uint32)
+    at = tuple(model.surface_index.T)
+    solid = model.occupancy.copy()
+    solid[at] = True
+    boxes = empty_boxes(solid).astype(np.uint32)
+    words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
     normal = np.rint(model.surface_normal * 127).astype(np.int64)
     offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
     plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
-    words[tuple(model.surface_index.T)] = plane
-    return words.view(np.int32).ravel()
+    words[:, *at] = plane
+    return words.view(np.int32)
 
 
 def library_arrays(library: Library) -> LibraryArrays:
@@ -86,7 +89,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     count = len(models)
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
     sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
-    grids = [pack_voxels(m) for m in models]
+    grids = [pack_voxels(m).ravel() for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
     alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
     first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.model.library_arrays import NUM_FACES, LibraryArrays
+from bayes3d_ros.model.library_arrays import EMPTY, NUM_FACES, LibraryArrays
 
 
 class Contact(NamedTuple):
@@ -85,5 +85,4 @@ def _share_inside(
     index = jnp.clip(index, 0, dims - 1)
     flat = (index[..., 0] * dims[..., 1] + index[..., 1]) * dims[..., 2] + index[..., 2]
     word = library.words[library.first[b.type][..., None] + flat]
-    occupied = (word == 0) | ((word & -256) != 0)
-    return (within & occupied).mean(-1)
+    return (within & (word >= EMPTY)).mean(-1)

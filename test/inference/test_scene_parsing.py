@@ -90,8 +90,9 @@ def test_two_objects_are_found(parser, library, pose):
     assert set(np.unique(result.segmentation)) == {0, 1, 2}
     seen = result.segmentation > 0
     miss = np.abs(result.reconstruction - observed.depth)[seen]
-    # Of a mean, pixels along the outlines, one object's depth against another's, would be the larger part.
-    assert np.median(miss) < SIGMA and (miss < 4 * SIGMA).mean() > 0.95
+    # Of a mean, pixels along the outlines, one object's depth against another's, would be the larger part. A median of
+    # the noise alone is 0.67 SIGMA; the scene that is drawn lies off by the smooth errors that it supposes, some mm.
+    assert np.median(miss) < 1.5 * SIGMA and (miss < 4 * SIGMA).mean() > 0.95
 
 
 def test_empty_table_has_no_object(parser, library):

@@ -15,7 +15,7 @@ from numba import cfunc, njit, types
 from numba.extending import intrinsic
 
 from bayes3d_ros.model.kernels.call_frame import answered_version, float_results, floats, integers, register
-from bayes3d_ros.model.library_arrays import OFFSET_RANGE
+from bayes3d_ros.model.library_arrays import EMPTY, OFFSET_RANGE
 from bayes3d_ros.model.likelihood import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
 from bayes3d_ros.model.rendering.voxel_march import INFLATION, MOST_STEPS, NEAR, NUDGE
 from bayes3d_ros.model.tiling import BEHIND, ROUNDING
@@ -54,9 +54,11 @@ class Lanes(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A voxel grid and a camera: where its words begin, its size, and where the eye is, in voxels."""
+    """A voxel grid and a camera: where its words begin, how many an octant has, its size, and where the eye is, in
+    voxels."""
 
     first: int
+    voxels: int
     nx: float
     ny: float
     nz: float
@@ -161,7 +163,8 @@ def _find(grid, lanes, count):
             _cell(grid.eye_y, dy[k], at, grid.ny),
             _cell(grid.eye_z, dz[k], at, grid.nz),
         )
-        word[k] = grid.first + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
+        octant = i32(i32(4) * i32(dx[k] < f32(0.0)) + i32(2) * i32(dy[k] < f32(0.0)) + i32(dz[k] < f32(0.0)))
+        word[k] = grid.first + octant * grid.voxels + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
 
 
 @_lanes
@@ -173,7 +176,7 @@ def _look_up(words, lanes, count):
 
 @_lanes
 def _advance(grid, lanes, count):
-    """One step of every ray: test its voxel, and go on to where the empty cube around it ends. A ray that has met a
+    """One step of every ray: test its voxel, and go on to where the empty box ahead of it ends. A ray that has met a
     surface at depth z holds -z from then on."""
     zero, half = f32(0.0), f32(0.5)
     dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
@@ -184,12 +187,13 @@ def _advance(grid, lanes, count):
         ra = grid.eye_x - _cell(grid.eye_x, a, at, grid.nx) - half
         rb = grid.eye_y - _cell(grid.eye_y, b, at, grid.ny) - half
         rc = grid.eye_z - _cell(grid.eye_z, c, at, grid.nz) - half
-        surface = (w & i32(-256)) != i32(0)
-        empty = f32(w & i32(255)) - half
-        reach = half if surface else empty
+        empty = w < i32(EMPTY)
+        reach_a = f32((w >> i32(16)) & i32(255)) - half if empty else half
+        reach_b = f32((w >> i32(8)) & i32(255)) - half if empty else half
+        reach_c = f32(w & i32(255)) - half if empty else half
         ia, ib, ic = f32(1.0) / a, f32(1.0) / b, f32(1.0) / c
         la, lb, lc = abs(ia), abs(ib), abs(ic)
-        out = min(reach * la - ra * ia, min(reach * lb - rb * ib, reach * lc - rc * ic))
+        out = min(reach_a * la - ra * ia, min(reach_b * lb - rb * ib, reach_c * lc - rc * ic))
         na, nb, nc = f32(w >> i32(24)), f32(i32(w << i32(8)) >> i32(24)), f32(i32(w << i32(16)) >> i32(24))
         offset = f32(i32(w << i32(24)) >> i32(24)) * f32(OFFSET_RANGE)
         facing = na * a + nb * b + nc * c
@@ -197,7 +201,7 @@ def _advance(grid, lanes, count):
         meet = (offset - (na * ra + nb * rb + nc * rc)) / facing
         far = max(abs(ra + meet * a), max(abs(rb + meet * b), abs(rc + meet * c)))
         then = max(out, at) + f32(NUDGE) * min(la, min(lb, lc))
-        then = -meet if (surface and far <= f32(0.5 + INFLATION) and meet > f32(NEAR)) else then
+        then = -meet if (not empty and far <= f32(0.5 + INFLATION) and meet > f32(NEAR)) else then
         then = -at if w == i32(0) else then
         t[k] = then if (now >= zero and now < end) else now
 
@@ -397,6 +401,7 @@ def _draw_object(words, first, dims, origin, size, pose, picture, rectangle, pat
             turn[3 * k + axis] = pose[4 * k + axis] * scale
     grid = Grid(
         i32(first),
+        i32(dims[0] * dims[1] * dims[2]),
         f32(dims[0]),
         f32(dims[1]),
         f32(dims[2]),

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.model.library_arrays import OFFSET_RANGE, LibraryArrays
+from bayes3d_ros.model.library_arrays import EMPTY, OFFSET_RANGE, LibraryArrays
 
 INFLATION = 0.2  # voxels
 NEAR = 0.05  # metres: nothing is met before
@@ -30,7 +30,7 @@ class Rays(NamedTuple):
     """Rays in voxel units of the grid that each walks through. What belongs to the object is one element a ray too, or
     broadcasts against the rays."""
 
-    first: Int[Array, "*objects"]
+    first: Int[Array, "*shape"]  # of the words for directions of its octant
     dims: tuple[Float[Array, "*objects"], ...]
     origin: tuple[Float[Array, "*objects"], ...]
     direction: tuple[Float[Array, "*shape"], ...]
@@ -86,6 +86,8 @@ def enter_grid(
     for a in (1, 2):
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
+    octant = sum((c < 0).astype(jnp.int32) << bit for c, bit in zip(d, (2, 1, 0), strict=True))
+    first = first + octant * (dims[0] * dims[1] * dims[2]).astype(jnp.int32)  # below 2^24: exact
     return Rays(first, tuple(dims), tuple(eye), tuple(d), leave), jnp.maximum(enter, near) + _nudge(d)
 
 
@@ -171,7 +173,7 @@ def _look_up(words: Int[Array, "V"]) -> Callable:
 
 
 def advance(look_up: Callable, walk: Rays, t: Array, near: float) -> Array:
-    """One step: test the voxel at t, and go on to where the empty cube around it ends. A ray that has met a surface at
+    """One step: test the voxel at t, and go on to where the empty box ahead of it ends. A ray that has met a surface at
     depth z holds -z from then on: with a second array, a CPU would work all of it out twice."""
     o, d, dims = walk.origin, walk.direction, walk.dims
     active = on_its_way(t, walk.leave)
@@ -179,16 +181,18 @@ def advance(look_up: Callable, walk: Rays, t: Array, near: float) -> Array:
     cell = [jnp.clip(jnp.floor(a + at * c), 0.0, n - 1.0) for a, c, n in zip(o, d, dims, strict=True)]
     index = ((cell[0] * dims[1] + cell[1]) * dims[2] + cell[2]).astype(jnp.int32)  # below 2^24: exact
     word, cell = look_up(walk.first + index, cell)
-    surface = (word & -256) != 0
-    half = jnp.where(surface, 0.5, (word & 255).astype(jnp.float32) - 0.5)
+    empty = word < EMPTY
     from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]
-    exits = [(jnp.where(c > 0, half, -half) - r) / c for c, r in zip(d, from_centre, strict=True)]
+    sides = [((word >> shift) & 255).astype(jnp.float32) for shift in (16, 8, 0)]
+    ahead = [jnp.where(empty, side - 0.5, 0.5) for side in sides]
+    exits = [(jnp.where(c > 0, a, -a) - r) / c for a, c, r in zip(ahead, d, from_centre, strict=True)]
     normal = [_byte(word, shift) for shift in (24, 16, 8)]
     facing = sum(n * c for n, c in zip(normal, d, strict=True))
-    ahead = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
-    meet = ahead / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
+    apart = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
+    meet = apart / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
     reach = [jnp.abs(r + meet * c) for r, c in zip(from_centre, d, strict=True)]
     on_plane = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2]) <= 0.5 + INFLATION
-    met = jnp.where(surface, on_plane & (meet > near), word == 0)
+    inside = word == 0
+    met = inside | (~empty & on_plane & (meet > near))
     beyond = jnp.maximum(jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2]), t) + _nudge(d)
-    return jnp.where(active, jnp.where(met, jnp.where(surface, -meet, -t), beyond), t)
+    return jnp.where(active, jnp.where(met, -jnp.where(inside, t, meet), beyond), t)
