@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.model.empty_boxes import empty_boxes
+from bayes3d_ros.model.hull import hull
 from bayes3d_ros.model.lookalikes import lookalikes
 from bayes3d_ros.model.objects import Library, ObjectModel
 
@@ -36,6 +37,8 @@ class LibraryArrays(NamedTuple):
     origin: Float[Array, "K 3"]
     T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
     face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
+    hull_corner: Float[Array, "K 32 3"]  # of a convex solid around the object (`hull.py`), object frame
+    hull_edge: Int[Array, "K 48 2"]
     radius: Float[Array, "K"]  # of a ball about the box centre
     sketch: Float[Array, "K P 3"]  # surface points, object frame
     sketch_normal: Float[Array, "K P 3"]
@@ -71,15 +74,13 @@ def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
 
 def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
     """The model's grid as 32-bit words (see LibraryArrays)."""
-    at = tuple(model.surface_index.T)
-    solid = model.occupancy.copy()
-    solid[at] = True
+    solid = _solid(model)
     boxes = empty_boxes(solid).astype(np.uint32)
     words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
     normal = np.rint(model.surface_normal * 127).astype(np.int64)
     offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
     plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
-    words[:, *at] = plane
+    words[:, *model.surface_index.T] = plane
     return words.view(np.int32)
 
 
@@ -89,6 +90,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     count = len(models)
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
     sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
+    hulls = [hull(np.argwhere(_solid(m))) for m in models]
     grids = [pack_voxels(m).ravel() for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
     alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
@@ -109,6 +111,8 @@ def library_arrays(library: Library) -> LibraryArrays:
         origin=stack([m.origin for m in models]),
         T_contact_object=stack(T_contact_object),
         face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
+        hull_corner=stack([m.origin + h[0] * m.voxel_size for m, h in zip(models, hulls, strict=True)]),
+        hull_edge=stack([h[1] for h in hulls], np.int32),
         radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
         sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
         sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),
@@ -117,6 +121,13 @@ def library_arrays(library: Library) -> LibraryArrays:
         alike_face=stack([a.face for a in alike], np.int32),
         alike_shift=stack([a.shift for a in alike]),
     )
+
+
+def _solid(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:
+    """The voxels that are of the solid or hold some of its surface."""
+    solid = model.occupancy.copy()
+    solid[tuple(model.surface_index.T)] = True
+    return solid
 
 
 def _inside(model: ObjectModel) -> Float[np.ndarray, "Q 3"]:

@@ -51,6 +51,13 @@ def test_depth_is_that_of_the_walk(drawn, marched, image, arrays):
     assert different.mean() < 2e-4  # rays along an edge, which rounding decides
 
 
+def test_a_hypothesis_does_not_depend_on_those_before_it(drawn, image, arrays):
+    """Lanes are used again and again, also those beyond the last ray."""
+    many = Drawn(*(jnp.tile(a, (40,) + (1,) * (a.ndim - 1)) for a in drawn[:3]))
+    depth = np.asarray(compiled_depth(many, None, image, arrays)).reshape(40, COUNT, HEIGHT, WIDTH)
+    assert (depth == depth[0]).all()
+
+
 def test_depth_goes_into_the_images_that_there_are(drawn, marched, image, arrays):
     before, after, border = 0.45, np.inf, 2
     start = np.full((COUNT, HEIGHT + 5, WIDTH + 7), before, np.float32)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from numba import cfunc, njit, types
 from numba.extending import intrinsic
 
+from bayes3d_ros.model.hull import CORNERS, EDGES
 from bayes3d_ros.model.kernels.call_frame import answered_version, float_results, floats, integers, register
 from bayes3d_ros.model.library_arrays import EMPTY, OFFSET_RANGE
 from bayes3d_ros.model.likelihood import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
@@ -27,10 +28,10 @@ u64 = np.uint64
 
 GAIN, DEPTH = "bayes3d_gain_of_hypotheses", "bayes3d_depth_of_hypotheses"  # to XLA
 _LANES = 256  # rays side by side: their state stays in the first-level cache
-_FRESH = 64  # that enter a grid at a time
+_FRESH = 64  # places to be free before more are sent
 _WIDE = 64  # pixels whose windows are looked at side by side
 _VECTOR = 8  # loops run over multiples of it: what lies beyond the last lane is worked out and not used
-_FIRST_STEPS, _STEPS = 3, 2  # between two times that rays that have ended make room
+_FIRST_STEPS, _STEPS = 2, 2  # between two times that rays that have ended make room
 _NOTHING = 1e9  # metres: no surface there
 
 # NaN and inf are kept out before; sums may be taken in any order.
@@ -130,11 +131,11 @@ def _cell(eye, d, at, n):
 
 
 @_lanes
-def _enter(grid, turn, rays, count):
+def _enter(grid, turn, lanes, first, last):
     """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the grid."""
     tiny, zero = f32(1e-6), f32(0.0)
-    dx, dy, dz, t, leave = rays.x, rays.y, rays.z, rays.t, rays.leave
-    for k in range(u64(count)):
+    dx, dy, dz, t, leave = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave
+    for k in range(u64(first), u64(last)):
         x, y = dx[k], dy[k]
         a = turn[0] * x + turn[3] * y + turn[6]
         b = turn[1] * x + turn[4] * y + turn[7]
@@ -207,16 +208,12 @@ def _advance(grid, lanes, count):
 
 
 @_lanes
-def _append(rays, count, lanes, used):
-    """Those of the first rays that meet the grid, after the lanes in use."""
-    dx, dy, dz, t, leave, place = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
-    used = u64(used)
+def _place_rays(ray_x, first, count, y, pixel, lanes, used):
+    """Rays of a few pixels of a row into the lanes after those in use."""
+    x, dy, place = lanes.x, lanes.y, lanes.pixel
+    first, used = u64(first), u64(used)
     for k in range(u64(count)):
-        at, end = rays.t[k], rays.leave[k]
-        dx[used], dy[used], dz[used] = rays.x[k], rays.y[k], rays.z[k]
-        t[used], leave[used], place[used] = at, end, rays.pixel[k]
-        used += u64(at < end)
-    return np.int64(used)
+        x[used + k], dy[used + k], place[used + k] = ray_x[first + k], y, i32(pixel + k)
 
 
 @_lanes
@@ -259,6 +256,8 @@ class Things(NamedTuple):
     origin: Float[np.ndarray, "T*3"]
     size: Float[np.ndarray, "T"]
     kind: Int[np.ndarray, "N*K"]
+    hull_corner: Float[np.ndarray, "T*32*3"]
+    hull_edge: Int[np.ndarray, "T*48*2"]
     pose: Float[np.ndarray, "N*K*12"]
 
 
@@ -281,8 +280,11 @@ class Space(NamedTuple):
     """What one hypothesis after the other is worked out in: a patch of the image, with half a window of border."""
 
     lanes: Lanes
-    rays: Lanes  # that are to enter
     turn: Float[np.ndarray, "9"]
+    corner_u: Float[np.ndarray, "32"]  # of an object's hull, in the image
+    corner_v: Float[np.ndarray, "32"]
+    left: Float[np.ndarray, "H"]  # where the hull begins and ends in each row
+    right: Float[np.ndarray, "H"]
     patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
     before: Float[np.ndarray, "I"]  # of its scene
     depth: Float[np.ndarray, "I"]  # observed
@@ -329,7 +331,8 @@ def _new_space(height, width, border):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
-        _new_lanes(_LANES + 2 * _VECTOR), _new_lanes(_FRESH + _VECTOR), np.empty(9, np.float32), nothing,
+        _new_lanes(_LANES + 2 * _VECTOR), np.empty(9, np.float32), np.empty(CORNERS, np.float32),
+        np.empty(CORNERS, np.float32), np.empty(height, np.float32), np.empty(height, np.float32), nothing,
         nothing.copy(), nothing.copy(), none, flags, flags.copy(), flags.copy(), none.copy(),
         nothing.copy(), nothing.copy(), nothing.copy(), nothing.copy(), none.copy(),
     )  # fmt: skip
@@ -354,34 +357,62 @@ def _new_windows(points):
     )
 
 
-@_whole
-def _outline(pose, origin, dims, size, picture):
-    """First and one past the last column and row that a grid's box may cover, none where it lies behind the camera."""
-    height, width = len(picture.ray_y), len(picture.ray_x)
-    u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
-    near, far = np.inf, -np.inf
-    for corner in range(8):
-        a = origin[0] + (corner & 1) * dims[0] * size
-        b = origin[1] + ((corner >> 1) & 1) * dims[1] * size
-        c = origin[2] + ((corner >> 2) & 1) * dims[2] * size
+@_lanes
+def _project(corners, pose, picture, corner_u, corner_v):
+    """Where corners are in the image; the nearest and the farthest, the first and the last column, and row."""
+    none = f32(FAR_AWAY)
+    near, far, left, right, top, bottom = none, -none, none, -none, none, -none
+    for k in range(u64(CORNERS)):
+        a, b, c = corners[u64(3) * k], corners[u64(3) * k + u64(1)], corners[u64(3) * k + u64(2)]
         x = pose[0] * a + pose[1] * b + pose[2] * c + pose[3]
         y = pose[4] * a + pose[5] * b + pose[6] * c + pose[7]
         z = pose[8] * a + pose[9] * b + pose[10] * c + pose[11]
-        if not (abs(x) < FAR_AWAY and abs(y) < FAR_AWAY and abs(z) < FAR_AWAY):  # NaN too
-            return 0, 0, 0, 0
         near, far = min(near, z), max(far, z)
-        u = picture.focal_x * x / max(z, f32(BEHIND)) + picture.centre_x
-        v = picture.focal_y * y / max(z, f32(BEHIND)) + picture.centre_y
-        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+        z = max(z, f32(BEHIND))
+        u, v = picture.focal_x * x / z + picture.centre_x, picture.focal_y * y / z + picture.centre_y
+        corner_u[k], corner_v[k] = u, v
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    return near, far, left, right, top, bottom
+
+
+@_whole
+def _outline(pose, corners, picture, space):
+    """First and one past the last column and row that an object may cover, none where it lies behind the camera; and
+    whether some of it does."""
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    for number in pose:
+        if not abs(number) < FAR_AWAY:  # NaN too
+            return (0, 0, 0, 0), False
+    near, far, left, right, top, bottom = _project(corners, pose, picture, space.corner_u, space.corner_v)
     if far < BEHIND:
-        return 0, 0, 0, 0
+        return (0, 0, 0, 0), False
     if near < BEHIND:
-        return 0, width, 0, height
-    left, right = np.ceil(u0 - ROUNDING), np.floor(u1 + ROUNDING) + 1
-    top, bottom = np.ceil(v0 - ROUNDING), np.floor(v1 + ROUNDING) + 1
+        return (0, width, 0, height), True
+    left, right = np.ceil(left - f32(ROUNDING)), np.floor(right + f32(ROUNDING)) + f32(1.0)
+    top, bottom = np.ceil(top - f32(ROUNDING)), np.floor(bottom + f32(ROUNDING)) + f32(1.0)
     if left >= width or right <= 0 or top >= height or bottom <= 0:
-        return 0, 0, 0, 0
-    return int(max(left, 0)), int(min(right, width)), int(max(top, 0)), int(min(bottom, height))
+        return (0, 0, 0, 0), False
+    return (int(max(left, 0.0)), int(min(right, width)), int(max(top, 0.0)), int(min(bottom, height))), False
+
+
+@_whole
+def _cut_rows(edges, first, last, space):
+    """Where the outline of a hull, whose corners are in the image, begins and ends in each of some rows."""
+    u, v, left, right, rounding = space.corner_u, space.corner_v, space.left, space.right, f32(ROUNDING)
+    for row in range(first, last):
+        left[row], right[row] = f32(_NOTHING), f32(-_NOTHING)
+    for edge in range(u64(EDGES)):
+        i, j = u64(edges[u64(2) * edge]), u64(edges[u64(2) * edge + u64(1)])
+        if v[i] > v[j]:
+            i, j = j, i
+        low, high, tall = min(u[i], u[j]), max(u[i], u[j]), v[j] - v[i]
+        slope = (u[j] - u[i]) / max(tall, rounding)
+        begin, end = max(np.ceil(v[i] - rounding), f32(first)), min(np.floor(v[j] + rounding), f32(last - 1))
+        for row in range(np.int64(begin), np.int64(end) + 1):
+            at = min(max(u[i] + (f32(row) - v[i]) * slope, low), high)
+            level = tall < f32(2.0) * rounding
+            left[u64(row)] = min(left[u64(row)], low if level else at)
+            right[u64(row)] = max(right[u64(row)], high if level else at)
 
 
 @_lanes
@@ -391,16 +422,25 @@ def _eye(pose, origin, axis):
 
 
 @_whole
-def _draw_object(words, first, dims, origin, size, pose, picture, rectangle, patch, stride, shift, space):
+def _draw_object(things, thing, picture, patch, stride, shift, space):
     """The depth of an object, where it is nearer than what is in the patch."""
-    u0, u1, v0, v1 = rectangle
-    turn, lanes, rays = space.turn, space.lanes, space.rays
-    scale = f32(1.0) / size
+    kind, pose, turn, lanes = things.kind[thing], things.pose[12 * thing : 12 * thing + 12], space.turn, space.lanes
+    origin, dims = things.origin[3 * kind : 3 * kind + 3], things.dims[3 * kind : 3 * kind + 3]
+    corners = things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)]
+    (u0, u1, v0, v1), behind = _outline(pose, corners, picture, space)
+    if u1 <= u0:
+        return
+    if behind:
+        _fill(space.left, v1, f32(0.0))
+        _fill(space.right, v1, f32(u1))
+    else:
+        _cut_rows(things.hull_edge[2 * EDGES * kind : 2 * EDGES * (kind + 1)], v0, v1, space)
+    scale = f32(1.0) / things.size[kind]
     for axis in range(3):
         for k in range(3):
             turn[3 * k + axis] = pose[4 * k + axis] * scale
     grid = Grid(
-        i32(first),
+        things.first[kind],
         i32(dims[0] * dims[1] * dims[2]),
         f32(dims[0]),
         f32(dims[1]),
@@ -409,19 +449,21 @@ def _draw_object(words, first, dims, origin, size, pose, picture, rectangle, pat
         _eye(pose, origin, 1) * scale,
         _eye(pose, origin, 2) * scale,
     )
-    used, fresh = 0, 0
+    entered, used = 0, 0
     for v in range(v0, v1):
-        y, pixel = picture.ray_y[v], v * stride + shift
-        for u in range(u0, u1):
-            rays.x[fresh], rays.y[fresh], rays.pixel[fresh] = picture.ray_x[u], y, pixel + u
-            fresh += 1
-            if fresh == _FRESH or (u == u1 - 1 and v == v1 - 1):
-                _enter(grid, turn, rays, _whole_vectors(fresh))
-                if used + fresh > _LANES:
-                    used = _walk(words, grid, lanes, used, _LANES - _FRESH, patch)
-                used = _append(rays, fresh, lanes, used)
-                fresh = 0
-    _walk(words, grid, lanes, used, 0, patch)
+        first = max(int(np.ceil(max(space.left[v], f32(u0)) - f32(ROUNDING))), u0)
+        last = min(int(np.floor(min(space.right[v], f32(u1)) + f32(ROUNDING))) + 1, u1)
+        while first < last:
+            some = min(last - first, _LANES - used)
+            _place_rays(picture.ray_x, first, some, picture.ray_y[v], v * stride + shift + first, lanes, used)
+            first, used = first + some, used + some
+            if used == _LANES:
+                _enter(grid, turn, lanes, entered, used)
+                entered = used = _walk(things.words, grid, lanes, used, _LANES - _FRESH, patch)
+    for k in range(used, _whole_vectors(used)):  # or they would grow each time that they enter
+        lanes.x[k] = lanes.y[k] = f32(0.0)
+    _enter(grid, turn, lanes, entered, _whole_vectors(used))
+    _walk(things.words, grid, lanes, used, 0, patch)
 
 
 @_lanes
@@ -683,34 +725,22 @@ def _sum_of_logs(p, odds, at):
 
 
 @_whole
-def _boxes(things, n, objects, picture, boxes):
+def _rectangle(things, n, objects, picture, space):
     """The rectangle around the outlines of a hypothesis' objects."""
     u0, u1, v0, v1 = len(picture.ray_x), 0, len(picture.ray_y), 0
-    for k in range(objects):
-        thing = n * objects + k
+    for thing in range(n * objects, (n + 1) * objects):
         kind = things.kind[thing]
-        box = _outline(
-            things.pose[12 * thing : 12 * thing + 12], things.origin[3 * kind : 3 * kind + 3],
-            things.dims[3 * kind : 3 * kind + 3], things.size[kind], picture,
-        )  # fmt: skip
-        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = box[0], box[1], box[2], box[3]
+        corners = things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)]
+        box, _ = _outline(things.pose[12 * thing : 12 * thing + 12], corners, picture, space)
         if box[1] > box[0]:
             u0, u1, v0, v1 = min(u0, box[0]), max(u1, box[1]), min(v0, box[2]), max(v1, box[3])
     return u0, u1, v0, v1
 
 
 @_whole
-def _draw_objects(things, n, objects, picture, boxes, patch, stride, shift, space):
-    for k in range(objects):
-        if boxes[k, 1] > boxes[k, 0]:
-            thing = n * objects + k
-            kind = things.kind[thing]
-            box = (boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3])
-            _draw_object(
-                things.words, things.first[kind], things.dims[3 * kind : 3 * kind + 3],
-                things.origin[3 * kind : 3 * kind + 3], things.size[kind], things.pose[12 * thing : 12 * thing + 12],
-                picture, box, patch, stride, shift, space,
-            )  # fmt: skip
+def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
+    for thing in range(n * objects, (n + 1) * objects):
+        _draw_object(things, thing, picture, patch, stride, shift, space)
 
 
 @_whole
@@ -750,7 +780,7 @@ def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
 @_whole
 def _gains(
     things, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier, weight, window, everywhere, metres, share,
-    gain, space, windows, now, former, boxes
+    gain, space, windows, now, former
 ):  # fmt: skip
     count, border = len(planes) // 4, window // 2
     objects, levels = len(things.kind) // count, len(sigma) * len(p_outlier)
@@ -758,7 +788,7 @@ def _gains(
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
         flat = everywhere and _is_plane(plane)
-        rectangle = _boxes(things, n, objects, picture, boxes)
+        rectangle = _rectangle(things, n, objects, picture, space)
         if flat:
             rectangle = (0, len(picture.ray_x), 0, len(picture.ray_y))
         for level in range(levels):
@@ -770,7 +800,7 @@ def _gains(
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
             _draw_planes(plane, picture, space.patch, stride, shift)
-        _draw_objects(things, n, objects, picture, boxes, space.patch, stride, shift, space)
+        _draw_objects(things, n, objects, picture, space.patch, stride, shift, space)
         low, high = _mark(space.patch, space.before, size, space.changed)
         _windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -801,7 +831,7 @@ def _gains(
 
 
 @_whole
-def _depths(things, planes, picture, start, rows, columns, border, everywhere, depth, space, boxes):
+def _depths(things, planes, picture, start, rows, columns, border, everywhere, depth, space):
     """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
     with, or none, and what each hypothesis adds."""
     count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
@@ -813,8 +843,7 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
             _draw_planes(plane, picture, image, columns, shift)
-        _boxes(things, n, objects, picture, boxes)
-        _draw_objects(things, n, objects, picture, boxes, image, columns, shift, space)
+        _draw_objects(things, n, objects, picture, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
@@ -826,10 +855,10 @@ def _is_plane(plane):
 
 @_whole
 def _things(frame):
-    """The first seven arguments of both targets."""
+    """The first nine arguments of both targets."""
     return Things(
         integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4),
-        integers(frame, 5), floats(frame, 6),
+        integers(frame, 5), floats(frame, 6), integers(frame, 7), floats(frame, 8),
     )  # fmt: skip
 
 
@@ -838,19 +867,18 @@ def _gain(frame):
     """See `compiled_gain.compiled_gain`."""
     if answered_version(frame):
         return 0
-    things, planes, sigma = _things(frame), floats(frame, 7), floats(frame, 15)
-    numbers, settings = floats(frame, 12), integers(frame, 17)
+    things, planes, sigma = _things(frame), floats(frame, 9), floats(frame, 17)
+    numbers, settings = floats(frame, 14), integers(frame, 19)
     window = settings[0]
     picture = Picture(
-        floats(frame, 8), integers(frame, 9), floats(frame, 10), floats(frame, 11),
+        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13),
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
     _gains(
-        things, planes, picture, floats(frame, 13), settings[2:4], integers(frame, 14), sigma, floats(frame, 16),
+        things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
         numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
         _new_space(len(picture.ray_y), len(picture.ray_x), window // 2), _new_windows(window * window),
         np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
-        np.zeros((len(things.kind) * 4 // len(planes), 4), np.int64),
     )  # fmt: skip
     return 0
 
@@ -860,16 +888,15 @@ def _depth(frame):
     """See `compiled_gain.compiled_depth`."""
     if answered_version(frame):
         return 0
-    things, planes = _things(frame), floats(frame, 7)
-    numbers, shape, start = floats(frame, 10), integers(frame, 12), floats(frame, 11)
+    things, planes = _things(frame), floats(frame, 9)
+    numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
-        start, things.kind, floats(frame, 8), floats(frame, 9),
+        start, things.kind, floats(frame, 10), floats(frame, 11),
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
     _depths(
         things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
         _new_space(len(picture.ray_y), len(picture.ray_x), 0),
-        np.zeros((len(things.kind) * 4 // len(planes), 4), np.int64),
     )  # fmt: skip
     return 0
 
