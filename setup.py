@@ -41,6 +41,7 @@ setup(
         "jax>=0.6",
         "jaxlie>=1.4",
         "jaxtyping>=0.2.34",
+        "llvmlite>=0.44",  # numba's own, for a few vector instructions
         "matplotlib>=3.6",
         "mcap>=1.1",
         "networkx>=2.8",

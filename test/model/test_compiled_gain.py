@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numba
 import numpy as np
 import pytest
 
@@ -98,3 +99,18 @@ def test_exponentials_and_logarithms():
     np.testing.assert_allclose(got, np.exp(x.astype(float)), rtol=1e-5)
     x = np.float32(np.geomspace(1e-30, 1e30, 4001))
     np.testing.assert_allclose([loops._log(v) for v in x], np.log(x.astype(float)), rtol=1e-6, atol=3e-7)
+
+
+@pytest.mark.parametrize("permutes", [True, False])
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_packing(permutes, kind, monkeypatch):
+    """Members of every set of eight come first, in order, with the machine's own instruction and without."""
+    monkeypatch.setattr(loops, "_PERMUTES", permutes and loops._PERMUTES)
+    pack = numba.njit(lambda array, bits, orders, to: loops._pack(array, np.uint64(8), orders, bits, to, np.uint64(3)))
+    array, to = np.arange(100, 116).astype(kind), np.zeros(12, kind)
+    for bits in range(256):
+        pack(array, np.uint64(bits), loops._ORDERS, to)
+        members = [k for k in range(8) if bits >> k & 1]
+        assert loops._MEMBERS[bits] == len(members)
+        np.testing.assert_array_equal(to[3 : 3 + len(members)], array[8:][members])
+        assert sorted(to[3:11]) == sorted(array[8:]) and not to[:3].any() and not to[11:].any()

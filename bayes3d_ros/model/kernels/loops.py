@@ -11,7 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import cfunc, njit, types
+from numba.core import cgutils
+from numba.core.config import CPU_NAME  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
 from bayes3d_ros.model.hull import CORNERS, EDGES
@@ -34,12 +38,23 @@ _VECTOR = 8  # loops run over multiples of it: what lies beyond the last lane is
 _FIRST_STEPS, _STEPS = 2, 2  # between two times that rays that have ended make room
 _NOTHING = 1e9  # metres: no surface there
 
+# For every set of eight, in bits: the order that has its members first; and how many they are.
+_SETS = (np.arange(256)[:, None] >> np.arange(_VECTOR)) & 1
+_ORDERS = np.argsort(1 - _SETS, axis=1, kind="stable").astype(np.int32).ravel()
+_MEMBERS = _SETS.sum(1).astype(np.uint64)
+# Whether there is an instruction for it; not asked where numba is told to make code for another machine.
+_PERMUTES = CPU_NAME is None and get_host_cpu_features().get("avx2", False)
+
 # NaN and inf are kept out before; sums may be taken in any order.
 _FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
 _allocates = njit(cache=True, nogil=True, error_model="numpy")
 # Where nothing is allocated references need no counting, which takes as long as a short loop.
 _whole = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 _lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
+# A call takes as long as a step of a few rays.
+_within = njit(  # type: ignore[call-overload]
+    cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST, inline="always"
+)
 
 
 class Lanes(NamedTuple):
@@ -51,6 +66,13 @@ class Lanes(NamedTuple):
     t: Float[np.ndarray, "L"]
     leave: Float[np.ndarray, "L"]
     word: Int[np.ndarray, "L"]
+    pixel: Int[np.ndarray, "L"]
+
+
+class Met(NamedTuple):
+    """What rays have met: its depth, negative, and their pixel."""
+
+    t: Float[np.ndarray, "L"]
     pixel: Int[np.ndarray, "L"]
 
 
@@ -82,6 +104,70 @@ def _float_as_bits(context, number):
         return builder.bitcast(arguments[0], context.get_value_type(types.int32))
 
     return types.int32(types.float32), generate
+
+
+def _eight(context, builder, array_type, array, first):
+    """Where eight numbers of an array lie, as one vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    element = context.get_data_type(array_type.dtype)
+    return builder.bitcast(builder.gep(data, [first]), ir.VectorType(element, _VECTOR).as_pointer())
+
+
+@intrinsic
+def _negative(context, array, first):
+    """Which of eight numbers of an array are negative: a bit each."""
+
+    def generate(context, builder, signature, arguments):
+        numbers = builder.load(_eight(context, builder, signature.args[0], *arguments), align=4)
+        return _as_bits(builder, builder.fcmp_ordered("<", numbers, numbers.type(None)))
+
+    return types.uint64(array, first), generate
+
+
+@intrinsic
+def _less(context, array, other, first):
+    """Which of eight numbers of an array are less than those of another: a bit each."""
+
+    def generate(context, builder, signature, arguments):
+        a, b = (
+            builder.load(_eight(context, builder, signature.args[k], arguments[k], arguments[2]), align=4)
+            for k in range(2)
+        )
+        return _as_bits(builder, builder.fcmp_ordered("<", a, b))
+
+    return types.uint64(array, other, first), generate
+
+
+def _as_bits(builder, flags):
+    return builder.zext(builder.bitcast(flags, ir.IntType(_VECTOR)), ir.IntType(64))
+
+
+@intrinsic
+def _pack(context, array, first, orders, bits, target, to):
+    """target[to : to + 8] = eight numbers of an array, members of a set (a row of `_ORDERS`) first."""
+
+    def generate(context, builder, signature, arguments):
+        array, first, orders, bits, target, to = arguments
+        kinds = signature.args
+        numbers = builder.load(_eight(context, builder, kinds[0], array, first), align=4)
+        row = builder.mul(bits, bits.type(_VECTOR))
+        order = builder.load(_eight(context, builder, kinds[2], orders, row), align=4)
+        if _PERMUTES:
+            reals = ir.VectorType(ir.FloatType(), _VECTOR)
+            permute = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(reals, [reals, order.type]), "llvm.x86.avx2.permps"
+            )
+            packed = builder.call(permute, [builder.bitcast(numbers, reals), order])
+            packed = builder.bitcast(packed, numbers.type)
+        else:
+            packed, word = numbers, ir.IntType(32)
+            for k in range(_VECTOR):
+                one = builder.extract_element(numbers, builder.extract_element(order, word(k)))
+                packed = builder.insert_element(packed, one, word(k))
+        builder.store(packed, _eight(context, builder, kinds[4], target, to), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, first, orders, bits, target, to), generate
 
 
 @_lanes
@@ -153,7 +239,7 @@ def _enter(grid, turn, lanes, first, last):
         t[k] = max(enter, f32(NEAR)) + f32(NUDGE) * min(abs(ia), min(abs(ib), abs(ic)))
 
 
-@_lanes
+@_within
 def _find(grid, lanes, count):
     """Where in the words the voxels are that rays are in."""
     dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
@@ -168,14 +254,14 @@ def _find(grid, lanes, count):
         word[k] = grid.first + octant * grid.voxels + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
 
 
-@_lanes
+@_within
 def _look_up(words, lanes, count):
     word = lanes.word
     for k in range(u64(count)):
         word[k] = words[u64(word[k])]
 
 
-@_lanes
+@_within
 def _advance(grid, lanes, count):
     """One step of every ray: test its voxel, and go on to where the empty box ahead of it ends. A ray that has met a
     surface at depth z holds -z from then on."""
@@ -216,21 +302,33 @@ def _place_rays(ray_x, first, count, y, pixel, lanes, used):
         x[used + k], dy[used + k], place[used + k] = ray_x[first + k], y, i32(pixel + k)
 
 
-@_lanes
-def _make_room(lanes, count, patch):
+@_within
+def _make_room(lanes, count, met, patch):
     """Put down what has been met, and move the rays that go on together."""
     dx, dy, dz, t, leave, pixel = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
-    kept = u64(0)
-    for k in range(u64(count)):
-        now, end, at = t[k], leave[k], pixel[k]
-        patch[at] = min(patch[at], -now if now < f32(0.0) else f32(_NOTHING))
-        dx[kept], dy[kept], dz[kept], t[kept], leave[kept], pixel[kept] = dx[k], dy[k], dz[k], now, end, at
-        kept += u64((now >= f32(0.0)) & (now < end))
+    kept, ended = u64(0), u64(0)
+    for first in range(u64(0), u64(count), u64(_VECTOR)):
+        real = (u64(1) << min(u64(count) - first, u64(_VECTOR))) - u64(1)
+        hits = _negative(t, first) & real
+        on = _less(t, leave, first) & real & ~hits
+        _pack(t, first, _ORDERS, hits, met.t, ended)
+        _pack(pixel, first, _ORDERS, hits, met.pixel, ended)
+        ended += _MEMBERS[hits]
+        _pack(dx, first, _ORDERS, on, dx, kept)
+        _pack(dy, first, _ORDERS, on, dy, kept)
+        _pack(dz, first, _ORDERS, on, dz, kept)
+        _pack(t, first, _ORDERS, on, t, kept)
+        _pack(leave, first, _ORDERS, on, leave, kept)
+        _pack(pixel, first, _ORDERS, on, pixel, kept)
+        kept += _MEMBERS[on]
+    for k in range(ended):
+        at = met.pixel[k]
+        patch[at] = min(patch[at], -met.t[k])
     return np.int64(kept)
 
 
-@_whole
-def _walk(words, grid, lanes, count, most, patch):
+@_lanes
+def _walk(words, grid, lanes, count, most, met, patch):
     """The rays in the first lanes until at most so many are left; depth goes into the patch where it is nearer than
     what is there. Returns how many are left."""
     left, steps = MOST_STEPS, _FIRST_STEPS
@@ -241,7 +339,7 @@ def _walk(words, grid, lanes, count, most, patch):
             _look_up(words, lanes, full)
             _advance(grid, lanes, full)
         left, steps = left - steps, _STEPS
-        count = _make_room(lanes, count, patch)
+        count = _make_room(lanes, count, met, patch)
         if left <= 0:
             return 0
     return count
@@ -280,6 +378,7 @@ class Space(NamedTuple):
     """What one hypothesis after the other is worked out in: a patch of the image, with half a window of border."""
 
     lanes: Lanes
+    met: Met
     turn: Float[np.ndarray, "9"]
     corner_u: Float[np.ndarray, "32"]  # of an object's hull, in the image
     corner_v: Float[np.ndarray, "32"]
@@ -331,11 +430,27 @@ def _new_space(height, width, border):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
-        _new_lanes(_LANES + 2 * _VECTOR), np.empty(9, np.float32), np.empty(CORNERS, np.float32),
-        np.empty(CORNERS, np.float32), np.empty(height, np.float32), np.empty(height, np.float32), nothing,
-        nothing.copy(), nothing.copy(), none, flags, flags.copy(), flags.copy(), none.copy(),
-        nothing.copy(), nothing.copy(), nothing.copy(), nothing.copy(), none.copy(),
-    )  # fmt: skip
+        _new_lanes(_LANES + 2 * _VECTOR),
+        Met(np.empty(_LANES + _VECTOR, np.float32), np.empty(_LANES + _VECTOR, np.int32)),
+        np.empty(9, np.float32),
+        np.empty(CORNERS, np.float32),
+        np.empty(CORNERS, np.float32),
+        np.empty(height, np.float32),
+        np.empty(height, np.float32),
+        nothing,
+        nothing.copy(),
+        nothing.copy(),
+        none,
+        flags,
+        flags.copy(),
+        flags.copy(),
+        none.copy(),
+        nothing.copy(),
+        nothing.copy(),
+        nothing.copy(),
+        nothing.copy(),
+        none.copy(),
+    )
 
 
 @_allocates
@@ -459,11 +574,11 @@ def _draw_object(things, thing, picture, patch, stride, shift, space):
             first, used = first + some, used + some
             if used == _LANES:
                 _enter(grid, turn, lanes, entered, used)
-                entered = used = _walk(things.words, grid, lanes, used, _LANES - _FRESH, patch)
+                entered = used = _walk(things.words, grid, lanes, used, _LANES - _FRESH, space.met, patch)
     for k in range(used, _whole_vectors(used)):  # or they would grow each time that they enter
         lanes.x[k] = lanes.y[k] = f32(0.0)
     _enter(grid, turn, lanes, entered, _whole_vectors(used))
-    _walk(things.words, grid, lanes, used, 0, patch)
+    _walk(things.words, grid, lanes, used, 0, space.met, patch)
 
 
 @_lanes
