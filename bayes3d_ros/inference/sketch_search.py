@@ -140,9 +140,61 @@ def score_cells(
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
-    kinds = library.first.shape[0]
+    """Sketch scores of all cells, -inf where not searched."""
+    if jax.default_backend() == "cpu":
+        return _compiled_cells(centres, count, evidence, image, library, table)
+    return cells_in_turn(centres, count, evidence, image, library, table)
+
+
+def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
+    """Face and yaw of every orientation."""
     face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
+    return face, (yaw + 0.5) * (2 * jnp.pi / YAWS)
+
+
+def _compiled_cells(
+    centres: Float[Array, "C 2"],
+    count: Int[Array, ""],
+    evidence: Evidence,
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+) -> Float[Array, "C K 6 Y"]:
+    """`cells_in_turn` by compiled loops."""
+    from bayes3d_ros.inference.compiled_sketch import sketch_scores  # takes a while to import
+
+    kinds, (face, yaw) = library.first.shape[0], _ways()
+    tolerance, penalty, points = _COARSE
+    shape = (kinds, len(face))
+    kind, face, yaw = (jnp.broadcast_to(a, shape).ravel() for a in (jnp.arange(kinds)[:, None], face, yaw))
+    zero = jnp.zeros(face.shape)
+    T = T_camera_object(Contact(kind, face, zero, zero, yaw), library, table)
+    point, normal = (jnp.stack(v).reshape(3, *shape, points) for v in _placed(T, kind, library, points))
+    scores = sketch_scores(
+        point,
+        normal,
+        _NATS * library.sketch_area * library.sketch.shape[1] / points * image.focal[0] * image.focal[1],
+        centres @ table.T_camera_table[:3, :2].T,
+        count,
+        library.num_types,
+        *evidence,
+        (image.focal, image.centre),
+        tolerance,
+        penalty,
+    )
+    return scores.reshape(-1, kinds, NUM_FACES, YAWS)
+
+
+def cells_in_turn(
+    centres: Float[Array, "C 2"],
+    count: Int[Array, ""],
+    evidence: Evidence,
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+) -> Float[Array, "C K 6 Y"]:
+    """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
+    kinds, (face, yaw) = library.first.shape[0], _ways()
     ways = NUM_FACES * YAWS
     tolerance, penalty, points = _COARSE
     blocks = -(-count // _BLOCK)
@@ -150,7 +202,7 @@ def score_cells(
 
     def of_kind(kind: Int[Array, ""], scores: Array) -> Array:
         zero = jnp.zeros(ways)
-        at_origin = Contact(jnp.full(ways, kind), face, zero, zero, (yaw + 0.5) * (2 * jnp.pi / YAWS))
+        at_origin = Contact(jnp.full(ways, kind), face, zero, zero, yaw)
         # Turned once for all cells.
         point, normal = _placed(T_camera_object(at_origin, library, table), at_origin.type, library, points)
         area = library.sketch_area[kind] * library.sketch.shape[1] / points
