@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, scale_warning
 
-MAX_VOXELS = 2**25
+MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
 SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
 REACH = 0.15  # a voxel's plane serves its cube inflated by this fraction of a voxel on every side
 

@@ -7,20 +7,25 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from numba import njit
 
-FARTHEST = 255  # voxels along an axis
+FARTHEST = 255  # voxels: the box reaches to where the grid ends, or beyond
+_MOST = 32  # voxels that other boxes have along an axis: longer ones take long to find and spare few steps
 OCTANTS = tuple(itertools.product((1, -1), repeat=3))  # signs of a direction along x, y, z; in this order everywhere
 
 
 def empty_boxes(solid: Bool[np.ndarray, "X Y Z"]) -> UInt8[np.ndarray, "8 X Y Z 3"]:
     """Sides, in voxels, of a box that holds nothing solid, has the voxel in its corner, and lies along an octant.
 
-    Beyond the grid nothing is solid. Sides grow in turn for as long as they can; they are zero for a solid voxel. A box
-    by octant lets a ray that passes a wall go on along it, where a cube around the voxel would end at the wall.
+    Beyond the grid nothing is solid. Sides grow in turn for as long as they can, to 32 voxels, or to the end of the
+    grid: then they are 255. They are zero for a solid voxel. A box by octant lets a ray that passes a wall go on along
+    it, where a cube around the voxel would end at the wall.
     """
 
     def ahead(octant: tuple[int, ...]) -> UInt8[np.ndarray, "X Y Z 3"]:
         turned = tuple(slice(None, None, sign) for sign in octant)
-        return _grown(np.pad(solid[turned], ((1, 0),) * 3).cumsum(0, np.int32).cumsum(1).cumsum(2))[turned]
+        sums = np.pad(solid[turned], ((1, 0),) * 3).astype(np.int32)
+        for axis in range(3):
+            np.cumsum(sums, axis, out=sums)
+        return _grown(sums)[turned]
 
     with ThreadPoolExecutor() as threads:
         return np.stack(list(threads.map(ahead, OCTANTS)))
@@ -43,13 +48,13 @@ def _grown(sums: Int[np.ndarray, "X1 Y1 Z1"]) -> UInt8[np.ndarray, "X Y Z 3"]:
                 at_x = at_y = at_z = True
                 while at_x or at_y or at_z:
                     if at_x:
-                        at_x = bool(x + a < nx and a < FARTHEST and _solid(sums, x, y, z, x + a + 1, y + b, z + c) == 0)
+                        at_x = bool(x + a < nx and a < _MOST and _solid(sums, x, y, z, x + a + 1, y + b, z + c) == 0)
                         a += at_x
                     if at_y:
-                        at_y = bool(y + b < ny and b < FARTHEST and _solid(sums, x, y, z, x + a, y + b + 1, z + c) == 0)
+                        at_y = bool(y + b < ny and b < _MOST and _solid(sums, x, y, z, x + a, y + b + 1, z + c) == 0)
                         b += at_y
                     if at_z:
-                        at_z = bool(z + c < nz and c < FARTHEST and _solid(sums, x, y, z, x + a, y + b, z + c + 1) == 0)
+                        at_z = bool(z + c < nz and c < _MOST and _solid(sums, x, y, z, x + a, y + b, z + c + 1) == 0)
                         c += at_z
                 cube[x, y, z] = min(a, b, c)
                 sides[x, y, z, 0] = FARTHEST if x + a >= nx else a

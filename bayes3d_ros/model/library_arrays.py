@@ -11,14 +11,14 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.model.empty_boxes import empty_boxes
 from bayes3d_ros.model.hull import hull
 from bayes3d_ros.model.lookalikes import lookalikes
-from bayes3d_ros.model.objects import Library, ObjectModel
+from bayes3d_ros.model.objects import Library, LibraryError, ObjectModel
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
 SKETCH_POINTS = 96  # surface points a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
-_TYPE_PAD, _VOXEL_PAD = 4, 1 << 16
+_TYPE_PAD, _VOXEL_PAD = 4, 1 << 19
 
 
 class LibraryArrays(NamedTuple):
@@ -95,6 +95,8 @@ def library_arrays(library: Library) -> LibraryArrays:
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
     alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
     first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
+    if first[-1] > np.iinfo(np.int32).max:
+        raise LibraryError(f"the library has {first[-1] // 8} voxels; {np.iinfo(np.int32).max // 8} can be addressed")
     words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
     words[: first[-1]] = np.concatenate(grids)
 

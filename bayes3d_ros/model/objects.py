@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bayes3d_ros.geometry.voxels import MAX_VOXELS
+
 FORMAT_VERSION = 1
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -69,6 +71,8 @@ def _check(model: ObjectModel) -> None:
         raise ValueError(f"voxel_size must be positive, got {model.voxel_size!r}")
     if model.occupancy.ndim != 3 or model.occupancy.dtype != bool or not model.occupancy.any():
         raise ValueError(f"occupancy must be a 3D bool array with a voxel set, got shape {model.occupancy.shape}")
+    if model.occupancy.size > MAX_VOXELS:
+        raise ValueError(f"occupancy may have {MAX_VOXELS} voxels at most, got shape {model.occupancy.shape}")
     count = len(model.surface_index)
     if count == 0:
         raise ValueError("surface_index must name at least one voxel")

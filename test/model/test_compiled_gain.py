@@ -105,7 +105,8 @@ def test_exponentials_and_logarithms():
 @pytest.mark.parametrize("kind", [np.float32, np.int32])
 def test_packing(permutes, kind, monkeypatch):
     """Members of every set of eight come first, in order, with the machine's own instruction and without."""
-    monkeypatch.setattr(loops, "_PERMUTES", permutes and loops._PERMUTES)
+    if not permutes:
+        monkeypatch.setattr(loops, "_permutes", lambda context: False)
     pack = numba.njit(lambda array, bits, orders, to: loops._pack(array, np.uint64(8), orders, bits, to, np.uint64(3)))
     array, to = np.arange(100, 116).astype(kind), np.zeros(12, kind)
     for bits in range(256):

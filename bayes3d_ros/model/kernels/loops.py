@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from llvmlite import ir
-from llvmlite.binding import get_host_cpu_features
 from numba import cfunc, njit, types
 from numba.core import cgutils
-from numba.core.config import CPU_NAME  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
 from bayes3d_ros.model.hull import CORNERS, EDGES
@@ -42,8 +40,6 @@ _NOTHING = 1e9  # metres: no surface there
 _SETS = (np.arange(256)[:, None] >> np.arange(_VECTOR)) & 1
 _ORDERS = np.argsort(1 - _SETS, axis=1, kind="stable").astype(np.int32).ravel()
 _MEMBERS = _SETS.sum(1).astype(np.uint64)
-# Whether there is an instruction for it; not asked where numba is told to make code for another machine.
-_PERMUTES = CPU_NAME is None and get_host_cpu_features().get("avx2", False)
 
 # NaN and inf are kept out before; sums may be taken in any order.
 _FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
@@ -138,6 +134,11 @@ def _less(context, array, other, first):
     return types.uint64(array, other, first), generate
 
 
+def _permutes(context):
+    """Whether the machine that code is made for orders a vector by one instruction."""
+    return "+avx2" in context.codegen().magic_tuple()[2].split(",")
+
+
 def _as_bits(builder, flags):
     return builder.zext(builder.bitcast(flags, ir.IntType(_VECTOR)), ir.IntType(64))
 
@@ -152,7 +153,7 @@ def _pack(context, array, first, orders, bits, target, to):
         numbers = builder.load(_eight(context, builder, kinds[0], array, first), align=4)
         row = builder.mul(bits, bits.type(_VECTOR))
         order = builder.load(_eight(context, builder, kinds[2], orders, row), align=4)
-        if _PERMUTES:
+        if _permutes(context):
             reals = ir.VectorType(ir.FloatType(), _VECTOR)
             permute = cgutils.get_or_insert_function(
                 builder.module, ir.FunctionType(reals, [reals, order.type]), "llvm.x86.avx2.permps"
@@ -537,13 +538,14 @@ def _eye(pose, origin, axis):
 
 
 @_whole
-def _draw_object(things, thing, picture, patch, stride, shift, space):
-    """The depth of an object, where it is nearer than what is in the patch."""
+def _draw_object(things, thing, picture, rectangle, patch, stride, shift, space):
+    """The depth of an object, where it is nearer than what is in the patch, which holds a rectangle of the image."""
     kind, pose, turn, lanes = things.kind[thing], things.pose[12 * thing : 12 * thing + 12], space.turn, space.lanes
     origin, dims = things.origin[3 * kind : 3 * kind + 3], things.dims[3 * kind : 3 * kind + 3]
     corners = things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)]
     (u0, u1, v0, v1), behind = _outline(pose, corners, picture, space)
-    if u1 <= u0:
+    u0, u1, v0, v1 = max(u0, rectangle[0]), min(u1, rectangle[1]), max(v0, rectangle[2]), min(v1, rectangle[3])
+    if u1 <= u0 or v1 <= v0:
         return
     if behind:
         _fill(space.left, v1, f32(0.0))
@@ -853,9 +855,9 @@ def _rectangle(things, n, objects, picture, space):
 
 
 @_whole
-def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
+def _draw_objects(things, n, objects, picture, rectangle, patch, stride, shift, space):
     for thing in range(n * objects, (n + 1) * objects):
-        _draw_object(things, thing, picture, patch, stride, shift, space)
+        _draw_object(things, thing, picture, rectangle, patch, stride, shift, space)
 
 
 @_whole
@@ -915,7 +917,7 @@ def _gains(
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
             _draw_planes(plane, picture, space.patch, stride, shift)
-        _draw_objects(things, n, objects, picture, space.patch, stride, shift, space)
+        _draw_objects(things, n, objects, picture, rectangle, space.patch, stride, shift, space)
         low, high = _mark(space.patch, space.before, size, space.changed)
         _windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -958,7 +960,8 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
             _draw_planes(plane, picture, image, columns, shift)
-        _draw_objects(things, n, objects, picture, image, columns, shift, space)
+        whole = (0, len(picture.ray_x), 0, len(picture.ray_y))
+        _draw_objects(things, n, objects, picture, whole, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
