@@ -294,7 +294,7 @@ def _advance(grid, lanes, count):
         t[k] = then if (now >= zero and now < end) else now
 
 
-@_lanes
+@_within
 def _place_rays(ray_x, first, count, y, pixel, lanes, used):
     """Rays of a few pixels of a row into the lanes after those in use."""
     x, dy, place = lanes.x, lanes.y, lanes.pixel
@@ -594,7 +594,7 @@ def _draw_plane(normal, offset, ray_x, y, patch, at):
         patch[at + k] = depth if (towards and depth > f32(0.0)) else f32(_NOTHING)
 
 
-@_lanes
+@_within
 def _copy_scene(scenes, scene_at, count, before, patch, at):
     """A row of what is there before; inf becomes _NOTHING."""
     scene_at, at = u64(scene_at), u64(at)
@@ -604,7 +604,7 @@ def _copy_scene(scenes, scene_at, count, before, patch, at):
         patch[at + k] = depth
 
 
-@_lanes
+@_within
 def _copy_returns(picture, pixel, count, depth, kind, at):
     """A row of the observed image."""
     every_depth, every_kind = picture.depth, picture.kind
@@ -742,7 +742,7 @@ def _begin_windows(picture, space, first, count, stride, left, top, windows):
         windows.outlier[k] = picture.outlier_scale * z * z
 
 
-@_lanes
+@_within
 def _pick_points(image, offset, windows, to, full):
     place, point = windows.place, windows.point
     to = u64(to)
@@ -750,7 +750,7 @@ def _pick_points(image, offset, windows, to, full):
         point[to + k] = image[u64(place[k] + offset)]
 
 
-@_lanes
+@_within
 def _measure(windows, to, ex, ey, full):
     """Squared distances of a point of every window from the ray of its middle, and along it."""
     depth, x, y, norm2, nearest = windows.depth, windows.x, windows.y, windows.norm2, windows.nearest
@@ -768,7 +768,7 @@ def _measure(windows, to, ex, ey, full):
         nearest[k] = min(nearest[k], apart)
 
 
-@_lanes
+@_within
 def _weigh(windows, to, scale, full):
     """A point of every window into the mixtures."""
     across, along, nearest, both, weight = (
@@ -786,7 +786,7 @@ def _weigh(windows, to, scale, full):
         weight[k] += w
 
 
-@_lanes
+@_within
 def _odds(windows, norm, count, odds, to):
     """Inliers' densities over outliers': of the mixture, 1 where a window holds no surface, and beyond the last."""
     outlier, norm2, nearest, both, weight = (
@@ -808,7 +808,7 @@ def _fill(array, count, value):
         array[k] = value
 
 
-@_whole
+@_lanes
 def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
     """Densities of inliers over those of outliers at every sigma, of the windows' points in an image."""
     full = _whole_vectors(count)
