@@ -18,6 +18,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
+from bayes3d_ros.ros.spinning import shut_down
 from bayes3d_ros.ros.transport import use_large_messages
 
 CLOCK_PERIOD = 0.01  # seconds of real time
@@ -173,7 +174,7 @@ def main(args: list[str] | None = None) -> int:
         if rclpy.ok():  # a signal between two calls of rclpy leaves the second one without a context
             raise
     finally:
-        rclpy.try_shutdown()
+        shut_down()
     return status
 
 

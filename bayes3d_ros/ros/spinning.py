@@ -50,10 +50,19 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
         if node is not None:
             stopped = node.stop(timeout=2.0)
             cast(Node, node).destroy_node()
-        rclpy.try_shutdown()
+        shut_down()
     if not stopped:
         # A compilation or a long frame cannot be interrupted, and the interpreter must not be torn down under it.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
     return 0
+
+
+def shut_down() -> None:
+    """End ROS, unless a signal has; also where it does so between rclpy's question and its call."""
+    try:
+        rclpy.try_shutdown()
+    except RuntimeError:
+        if rclpy.ok():
+            raise
