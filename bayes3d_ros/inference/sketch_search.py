@@ -47,9 +47,8 @@ def sketch_score(
     """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
     past, relative to the reward of one that matches; the first `points` of the sketch are used."""
     T = T_camera_object(contact, library, table)
-    scale = library.sketch_area[contact.type] * library.sketch.shape[1] / points
     point, normal = _placed(T, contact.type, library, points)
-    return _score(point, normal, scale, evidence, image, tolerance, penalty)
+    return _score(point, normal, _area(library, points)[contact.type], evidence, image, tolerance, penalty)
 
 
 class _Vectors(NamedTuple):
@@ -140,27 +139,9 @@ def score_cells(
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Sketch scores of all cells, -inf where not searched."""
-    if jax.default_backend() == "cpu":
-        return _compiled_cells(centres, count, evidence, image, library, table)
-    return cells_in_turn(centres, count, evidence, image, library, table)
-
-
-def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
-    """Face and yaw of every orientation."""
-    face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
-    return face, (yaw + 0.5) * (2 * jnp.pi / YAWS)
-
-
-def _compiled_cells(
-    centres: Float[Array, "C 2"],
-    count: Int[Array, ""],
-    evidence: Evidence,
-    image: Image,
-    library: LibraryArrays,
-    table: Table,
-) -> Float[Array, "C K 6 Y"]:
-    """`cells_in_turn` by compiled loops."""
+    """Sketch scores of all cells, -inf where not searched: on CPUs by compiled loops."""
+    if jax.default_backend() != "cpu":
+        return cells_in_turn(centres, count, evidence, image, library, table)
     from bayes3d_ros.inference.compiled_sketch import sketch_scores  # takes a while to import
 
     kinds, (face, yaw) = library.first.shape[0], _ways()
@@ -173,7 +154,7 @@ def _compiled_cells(
     scores = sketch_scores(
         point,
         normal,
-        _NATS * library.sketch_area * library.sketch.shape[1] / points * image.focal[0] * image.focal[1],
+        _NATS * _area(library, points) * image.focal[0] * image.focal[1],
         centres @ table.T_camera_table[:3, :2].T,
         count,
         library.num_types,
@@ -183,6 +164,17 @@ def _compiled_cells(
         penalty,
     )
     return scores.reshape(-1, kinds, NUM_FACES, YAWS)
+
+
+def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
+    """Face and yaw of every orientation."""
+    face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
+    return face, (yaw + 0.5) * (2 * jnp.pi / YAWS)
+
+
+def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
+    """Metres^2 that one of the first `points` of a type's sketch stands for."""
+    return library.sketch_area * library.sketch.shape[1] / points
 
 
 def cells_in_turn(
@@ -205,7 +197,7 @@ def cells_in_turn(
         at_origin = Contact(jnp.full(ways, kind), face, zero, zero, yaw)
         # Turned once for all cells.
         point, normal = _placed(T_camera_object(at_origin, library, table), at_origin.type, library, points)
-        area = library.sketch_area[kind] * library.sketch.shape[1] / points
+        area = _area(library, points)[kind]
 
         def of_block(block: Int[Array, ""], scores: Array) -> Array:
             xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))

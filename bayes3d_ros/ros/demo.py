@@ -31,6 +31,7 @@ from bayes3d_ros.ros.conversions import matrix_from_values
 from bayes3d_ros.ros.detections import detections_type
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
+from bayes3d_ros.ros.spinning import shut_down
 
 MESHES = (
     *("003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "010_potted_meat_can"),
@@ -115,7 +116,7 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
         _wait(executor, outputs, frame.stamp_ns, processes, say)
     finally:
         statuses = {name: process.stop() for name, process in processes.items()}
-        rclpy.try_shutdown(context=context)
+        shut_down(context)
     for name, status in statuses.items():
         if status != 0:
             raise DemoError(f"{name} ended with status {status}; see {processes[name].log}")

@@ -18,6 +18,7 @@ from bayes3d_ros.evaluation.speed_rows import SpeedRow
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 from bayes3d_ros.ros.received import stamp_of
+from bayes3d_ros.ros.spinning import shut_down
 
 __all__ = ["HEADER", "count", "line", "node_row", "rows"]
 
@@ -82,6 +83,6 @@ def node_row(case: Case, library: Path, logs: Path, rate: float = RATE) -> Speed
     finally:
         for process in processes:
             process.stop()
-        rclpy.try_shutdown(context=context)
+        shut_down(context)
     seconds = [came["poses"][stamp] - came["image"][stamp] for stamp in stamps if stamp in came["image"]]
     return parsing_row("node", case, f"{camera.width}x{camera.height}", seconds, most_objects)

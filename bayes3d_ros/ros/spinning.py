@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Protocol, cast
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
@@ -59,10 +60,10 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     return 0
 
 
-def shut_down() -> None:
+def shut_down(context: Context | None = None) -> None:
     """End ROS, unless a signal has; also where it does so between rclpy's question and its call."""
     try:
-        rclpy.try_shutdown()
+        rclpy.try_shutdown(context=context)
     except RuntimeError:
-        if rclpy.ok():
+        if rclpy.ok(context=context):
             raise
