@@ -23,7 +23,7 @@ from bayes3d_ros.model.likelihood import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
 from bayes3d_ros.model.rendering.voxel_march import INFLATION, MOST_STEPS, NEAR, NUDGE
 from bayes3d_ros.model.tiling import BEHIND, ROUNDING
 
-f32, i32 = np.float32, np.int32
+f32, i32, u8 = np.float32, np.int32, np.uint8
 # Places are unsigned: numba would let negative ones count from the end, and that keeps LLVM from seeing that arrays are
 # apart; loops would then run as scalars or as vectors, which round differently, as memory happens to be laid out.
 u64 = np.uint64
@@ -617,14 +617,15 @@ def _copy_returns(picture, pixel, count, depth, kind, at):
 @_lanes
 def _mark(patch, before, size, changed):
     """Where the hypothesis changes the patch; the least and the largest depth there."""
-    low, high = f32(_NOTHING), f32(0.0)
+    # As whole numbers, which are in the same order: LLVM makes scalars of the least of floats.
+    nothing = _float_as_bits(f32(_NOTHING))
+    low, high = nothing, i32(0)
     for k in range(u64(size)):
-        depth = patch[k]
-        new = depth < before[k]
-        changed[k] = np.uint8(new)
-        low = min(low, depth if new else f32(_NOTHING))
-        high = max(high, depth if new else f32(0.0))
-    return low, high
+        new, depth = patch[k] < before[k], _float_as_bits(patch[k])
+        changed[k] = u8(new)
+        low = min(low, depth if new else nothing)
+        high = max(high, depth if new else i32(0))
+    return _bits_as_float(low), _bits_as_float(high)
 
 
 @_whole
@@ -671,17 +672,17 @@ def _sort(space, first, last, low, high, front_margin):
         space.before,
         space.close,
     )
-    near, far, hidden = i32(0), i32(0), i32(0)
+    near, count, hidden = i32(0), i32(0), i32(0)
     for k in range(u64(first), u64(last)):
         z, sort = depth[k], kind[k]
-        counts = i32((seen[k] != np.uint8(0)) & (sort == i32(IN_WORKSPACE)))
-        looked = counts & i32((z > low) & (z < high))
-        close[k] = looked
-        near += looked
-        far += counts - looked
+        counts = (seen[k] != u8(0)) & (sort == i32(IN_WORKSPACE))
+        looked = counts & (z > low) & (z < high)
+        close[k] = u8(looked)
+        near = i32(near + i32(looked))
+        count = i32(count + i32(counts))
         limit = z + front_margin
-        hidden += i32((sort == i32(BEYOND)) & (patch[k] < limit) & (before[k] >= limit))
-    return near, far, hidden
+        hidden = i32(hidden + i32((sort == i32(BEYOND)) & (patch[k] < limit) & (before[k] >= limit)))
+    return near, count - near, hidden
 
 
 @_lanes
@@ -696,27 +697,38 @@ def _begin_ends(patch, size, low, high):
 def _widen_ends(low, high, first, last, step, border, least, most):
     """The least and the largest up to `border` steps to either side."""
     first, last, step = u64(first), u64(last), u64(step)
-    for k in range(first, last):
-        least[k], most[k] = low[k], high[k]
-    for apart in range(1, border + 1):
-        away = u64(apart) * step
+    if border == 1:
         for k in range(first, last):
-            least[k] = min(least[k], min(low[k - away], low[k + away]))
-            most[k] = max(most[k], max(high[k - away], high[k + away]))
+            least[k] = min(low[k], min(low[k - step], low[k + step]))
+            most[k] = max(high[k], max(high[k - step], high[k + step]))
+    elif border == 2:
+        two = u64(2) * step
+        for k in range(first, last):
+            least[k] = min(min(low[k], min(low[k - step], low[k + step])), min(low[k - two], low[k + two]))
+            most[k] = max(max(high[k], max(high[k - step], high[k + step])), max(high[k - two], high[k + two]))
+    else:
+        for k in range(first, last):
+            least[k], most[k] = low[k], high[k]
+        for apart in range(1, border + 1):
+            away = u64(apart) * step
+            for k in range(first, last):
+                least[k] = min(least[k], min(low[k - away], low[k + away]))
+                most[k] = max(most[k], max(high[k - away], high[k + away]))
 
 
 @_lanes
 def _sort_again(space, first, last, metres, share):
     """Of the pixels whose windows were to be looked at, those that are not too far from every surface of their own
     window; how many the others are."""
-    depth, close, low, high, far = space.depth, space.close, space.low, space.high, i32(0)
+    depth, close, low, high, left_out = space.depth, space.close, space.low, space.high, i32(0)
     for k in range(u64(first), u64(last)):
         z = depth[k]
         within = (z > low[k] * (f32(1.0) - share) - metres) & (z < high[k] * (f32(1.0) + share) + metres)
-        looked = close[k] & i32(within)
-        far += close[k] - looked
-        close[k] = looked
-    return far
+        before = close[k]
+        looked = (before != u8(0)) & within
+        left_out = i32(left_out + i32(before) - i32(looked))
+        close[k] = u8(looked)
+    return left_out
 
 
 @_lanes
