@@ -381,8 +381,11 @@ class Space(NamedTuple):
     lanes: Lanes
     met: Met
     turn: Float[np.ndarray, "9"]
-    corner_u: Float[np.ndarray, "32"]  # of an object's hull, in the image
-    corner_v: Float[np.ndarray, "32"]
+    corner_u: Float[np.ndarray, "K*32"]  # of the objects' hulls, in the image
+    corner_v: Float[np.ndarray, "K*32"]
+    corner_z: Float[np.ndarray, "32"]  # of one of them
+    box: Int[np.ndarray, "K*4"]  # first and one past the last column and row of each object; none where it is not seen
+    behind: Int[np.ndarray, "K"]  # whether some of it lies behind the camera
     left: Float[np.ndarray, "H"]  # where the hull begins and ends in each row
     right: Float[np.ndarray, "H"]
     patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
@@ -427,15 +430,18 @@ def _new_lanes(count):
 
 
 @_allocates
-def _new_space(height, width, border):
+def _new_space(height, width, border, objects):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
         _new_lanes(_LANES + 2 * _VECTOR),
         Met(np.empty(_LANES + _VECTOR, np.float32), np.empty(_LANES + _VECTOR, np.int32)),
         np.empty(9, np.float32),
+        np.empty(CORNERS * objects, np.float32),
+        np.empty(CORNERS * objects, np.float32),
         np.empty(CORNERS, np.float32),
-        np.empty(CORNERS, np.float32),
+        np.empty(4 * objects, np.int64),
+        np.empty(objects, np.uint8),
         np.empty(height, np.float32),
         np.empty(height, np.float32),
         nothing,
@@ -474,36 +480,43 @@ def _new_windows(points):
 
 
 @_lanes
-def _project(corners, pose, picture, corner_u, corner_v):
-    """Where corners are in the image; the nearest and the farthest, the first and the last column, and row."""
-    none = f32(FAR_AWAY)
-    near, far, left, right, top, bottom = none, -none, none, -none, none, -none
+def _project(corners, pose, picture, corner_u, corner_v, corner_z):
+    """Where corners are in the image, and how deep."""
     for k in range(u64(CORNERS)):
         a, b, c = corners[u64(3) * k], corners[u64(3) * k + u64(1)], corners[u64(3) * k + u64(2)]
         x = pose[0] * a + pose[1] * b + pose[2] * c + pose[3]
         y = pose[4] * a + pose[5] * b + pose[6] * c + pose[7]
         z = pose[8] * a + pose[9] * b + pose[10] * c + pose[11]
-        near, far = min(near, z), max(far, z)
+        corner_z[k] = z
         z = max(z, f32(BEHIND))
-        u, v = picture.focal_x * x / z + picture.centre_x, picture.focal_y * y / z + picture.centre_y
-        corner_u[k], corner_v[k] = u, v
-        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-    return near, far, left, right, top, bottom
+        corner_u[k] = picture.focal_x * x / z + picture.centre_x
+        corner_v[k] = picture.focal_y * y / z + picture.centre_y
 
 
 @_whole
-def _outline(pose, corners, picture, space):
+def _ends(numbers):
+    """The least and the largest."""
+    low = high = numbers[0]
+    for k in range(u64(1), u64(len(numbers))):
+        low, high = min(low, numbers[k]), max(high, numbers[k])
+    return low, high
+
+
+@_whole
+def _outline(pose, corners, picture, corner_u, corner_v, corner_z):
     """First and one past the last column and row that an object may cover, none where it lies behind the camera; and
     whether some of it does."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     for number in pose:
         if not abs(number) < FAR_AWAY:  # NaN too
             return (0, 0, 0, 0), False
-    near, far, left, right, top, bottom = _project(corners, pose, picture, space.corner_u, space.corner_v)
+    _project(corners, pose, picture, corner_u, corner_v, corner_z)
+    near, far = _ends(corner_z)
     if far < BEHIND:
         return (0, 0, 0, 0), False
     if near < BEHIND:
         return (0, width, 0, height), True
+    (left, right), (top, bottom) = _ends(corner_u), _ends(corner_v)
     left, right = np.ceil(left - f32(ROUNDING)), np.floor(right + f32(ROUNDING)) + f32(1.0)
     top, bottom = np.ceil(top - f32(ROUNDING)), np.floor(bottom + f32(ROUNDING)) + f32(1.0)
     if left >= width or right <= 0 or top >= height or bottom <= 0:
@@ -512,9 +525,9 @@ def _outline(pose, corners, picture, space):
 
 
 @_whole
-def _cut_rows(edges, first, last, space):
-    """Where the outline of a hull, whose corners are in the image, begins and ends in each of some rows."""
-    u, v, left, right, rounding = space.corner_u, space.corner_v, space.left, space.right, f32(ROUNDING)
+def _cut_rows(edges, u, v, first, last, left, right):
+    """Where the outline of a hull, whose corners are at (u, v), begins and ends in each of some rows."""
+    rounding = f32(ROUNDING)
     for row in range(first, last):
         left[row], right[row] = f32(_NOTHING), f32(-_NOTHING)
     for edge in range(u64(EDGES)):
@@ -538,24 +551,27 @@ def _eye(pose, origin, axis):
 
 
 @_whole
-def _draw_object(things, thing, picture, rectangle, patch, stride, shift, space):
-    """The depth of an object, where it is nearer than what is in the patch, which holds a rectangle of the image."""
+def _draw_object(things, thing, k, picture, patch, stride, shift, space):
+    """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
     kind, pose, turn, lanes = things.kind[thing], things.pose[12 * thing : 12 * thing + 12], space.turn, space.lanes
     origin, dims = things.origin[3 * kind : 3 * kind + 3], things.dims[3 * kind : 3 * kind + 3]
-    corners = things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)]
-    (u0, u1, v0, v1), behind = _outline(pose, corners, picture, space)
-    u0, u1, v0, v1 = max(u0, rectangle[0]), min(u1, rectangle[1]), max(v0, rectangle[2]), min(v1, rectangle[3])
-    if u1 <= u0 or v1 <= v0:
+    u0, u1, v0, v1 = space.box[4 * k], space.box[4 * k + 1], space.box[4 * k + 2], space.box[4 * k + 3]
+    if u1 <= u0:
         return
-    if behind:
+    if space.behind[k]:
         _fill(space.left, v1, f32(0.0))
         _fill(space.right, v1, f32(u1))
     else:
-        _cut_rows(things.hull_edge[2 * EDGES * kind : 2 * EDGES * (kind + 1)], v0, v1, space)
+        edges = things.hull_edge[2 * EDGES * kind : 2 * EDGES * (kind + 1)]
+        corner_u, corner_v = (
+            space.corner_u[CORNERS * k : CORNERS * (k + 1)],
+            space.corner_v[CORNERS * k : CORNERS * (k + 1)],
+        )
+        _cut_rows(edges, corner_u, corner_v, v0, v1, space.left, space.right)
     scale = f32(1.0) / things.size[kind]
     for axis in range(3):
-        for k in range(3):
-            turn[3 * k + axis] = pose[4 * k + axis] * scale
+        for row in range(3):
+            turn[3 * row + axis] = pose[4 * row + axis] * scale
     grid = Grid(
         things.first[kind],
         i32(dims[0] * dims[1] * dims[2]),
@@ -577,8 +593,8 @@ def _draw_object(things, thing, picture, rectangle, patch, stride, shift, space)
             if used == _LANES:
                 _enter(grid, turn, lanes, entered, used)
                 entered = used = _walk(things.words, grid, lanes, used, _LANES - _FRESH, space.met, patch)
-    for k in range(used, _whole_vectors(used)):  # or they would grow each time that they enter
-        lanes.x[k] = lanes.y[k] = f32(0.0)
+    for lane in range(used, _whole_vectors(used)):  # or they would grow each time that they enter
+        lanes.x[lane] = lanes.y[lane] = f32(0.0)
     _enter(grid, turn, lanes, entered, _whole_vectors(used))
     _walk(things.words, grid, lanes, used, 0, space.met, patch)
 
@@ -854,22 +870,32 @@ def _sum_of_logs(p, odds, at):
 
 
 @_whole
-def _rectangle(things, n, objects, picture, space):
-    """The rectangle around the outlines of a hypothesis' objects."""
+def _outlines(things, n, objects, picture, space):
+    """Finds where a hypothesis' objects are in the image. Returns the rectangle around them."""
     u0, u1, v0, v1 = len(picture.ray_x), 0, len(picture.ray_y), 0
-    for thing in range(n * objects, (n + 1) * objects):
+    for k in range(objects):
+        thing = n * objects + k
         kind = things.kind[thing]
-        corners = things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)]
-        box, _ = _outline(things.pose[12 * thing : 12 * thing + 12], corners, picture, space)
+        box, space.behind[k] = _outline(
+            things.pose[12 * thing : 12 * thing + 12],
+            things.hull_corner[3 * CORNERS * kind : 3 * CORNERS * (kind + 1)],
+            picture,
+            space.corner_u[CORNERS * k : CORNERS * (k + 1)],
+            space.corner_v[CORNERS * k : CORNERS * (k + 1)],
+            space.corner_z,
+        )
+        for side in range(4):
+            space.box[4 * k + side] = box[side]
         if box[1] > box[0]:
             u0, u1, v0, v1 = min(u0, box[0]), max(u1, box[1]), min(v0, box[2]), max(v1, box[3])
     return u0, u1, v0, v1
 
 
 @_whole
-def _draw_objects(things, n, objects, picture, rectangle, patch, stride, shift, space):
-    for thing in range(n * objects, (n + 1) * objects):
-        _draw_object(things, thing, picture, rectangle, patch, stride, shift, space)
+def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
+    """The objects whose outlines have been found, into a patch that holds them."""
+    for k in range(objects):
+        _draw_object(things, n * objects + k, k, picture, patch, stride, shift, space)
 
 
 @_whole
@@ -917,7 +943,7 @@ def _gains(
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
         flat = everywhere and _is_plane(plane)
-        rectangle = _rectangle(things, n, objects, picture, space)
+        rectangle = _outlines(things, n, objects, picture, space)
         if flat:
             rectangle = (0, len(picture.ray_x), 0, len(picture.ray_y))
         for level in range(levels):
@@ -929,7 +955,7 @@ def _gains(
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
             _draw_planes(plane, picture, space.patch, stride, shift)
-        _draw_objects(things, n, objects, picture, rectangle, space.patch, stride, shift, space)
+        _draw_objects(things, n, objects, picture, space.patch, stride, shift, space)
         low, high = _mark(space.patch, space.before, size, space.changed)
         _windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -972,8 +998,8 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
             _draw_planes(plane, picture, image, columns, shift)
-        whole = (0, len(picture.ray_x), 0, len(picture.ray_y))
-        _draw_objects(things, n, objects, picture, whole, image, columns, shift, space)
+        _outlines(things, n, objects, picture, space)
+        _draw_objects(things, n, objects, picture, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
@@ -1007,7 +1033,8 @@ def _gain(frame):
     _gains(
         things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
         numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2), _new_windows(window * window),
+        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2, len(things.kind) // max(len(planes) // 4, 1)),
+        _new_windows(window * window),
         np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
     )  # fmt: skip
     return 0
@@ -1026,7 +1053,7 @@ def _depth(frame):
     )  # fmt: skip
     _depths(
         things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), 0),
+        _new_space(len(picture.ray_y), len(picture.ray_x), 0, len(things.kind) // max(len(planes) // 4, 1)),
     )  # fmt: skip
     return 0
 
