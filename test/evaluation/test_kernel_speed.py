@@ -79,3 +79,25 @@ def test_every_size_and_number_of_hypotheses_is_measured(monkeypatch):
     assert kernel_speed.count() == len(kernel_speed.cases()) == 4 * 4 * 3 + 4 + 4
     assert ("render+score", "ours", 200, 16384) in kernel_speed.cases()
     assert ("render+score", "plain-jax", 100, 104) in kernel_speed.cases()
+
+
+def test_those_that_are_compared_take_turns(monkeypatch):
+    called = []
+    turns = {name: lambda name=name: called.append(name) or [float(len(called))] for name in ("a", "b")}
+    monkeypatch.setattr(kernel_speed, "_ROUNDS", 3)
+    assert kernel_speed._in_turn(turns) == {"a": [1.0, 3.0, 5.0], "b": [2.0, 4.0, 6.0]}
+    assert called == ["a", "b"] * 3
+
+
+def test_rows_come_in_the_order_of_the_cases(work, tmp_path, monkeypatch):
+    model = model_from_mesh(trimesh.creation.box(BOX), "block", 0.01)
+    mesh_file = tmp_path / "block.ply"
+    trimesh.creation.box(BOX).export(mesh_file)
+    monkeypatch.setattr(kernel_speed, "ycb_mesh", lambda name: mesh_file)
+    monkeypatch.setattr(kernel_speed, "ycb_library", lambda names, folder, voxel: save_model(model, folder))
+    for name, value in {"SIZES": (10,), "COUNTS": (1, 4), "PEER_COUNT": 4, "_ROUNDS": 2, "_AT_LEAST": 0.0}.items():
+        monkeypatch.setattr(kernel_speed, name, value)
+    monkeypatch.setattr(peers, "installed", list)
+    rows = [(r["what"], r["backend"], r["size"], r["hypotheses"]) for r in kernel_speed.rows()]
+    measured = [case for case in kernel_speed.cases() if case[0] != "score" or case in rows]
+    assert rows == measured and ("render+score", "plain-jax", 10, 4) in rows
