@@ -54,15 +54,19 @@ _within = njit(  # type: ignore[call-overload]
 
 
 class Lanes(NamedTuple):
-    """Rays in the voxels of one grid: direction, where they are, where they leave it, their word and pixel."""
+    """Rays in the voxels of one grid: direction, where they are, where they leave it, their pixel; the word of the
+    voxel that they are in, and the eye seen from its middle."""
 
     x: Float[np.ndarray, "L"]
     y: Float[np.ndarray, "L"]
     z: Float[np.ndarray, "L"]
     t: Float[np.ndarray, "L"]
     leave: Float[np.ndarray, "L"]
-    word: Int[np.ndarray, "L"]
     pixel: Int[np.ndarray, "L"]
+    word: Int[np.ndarray, "L"]
+    eye_x: Float[np.ndarray, "L"]
+    eye_y: Float[np.ndarray, "L"]
+    eye_z: Float[np.ndarray, "L"]
 
 
 class Met(NamedTuple):
@@ -242,15 +246,18 @@ def _enter(grid, turn, lanes, first, last):
 
 @_within
 def _find(grid, lanes, count):
-    """Where in the words the voxels are that rays are in."""
-    dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
+    """The voxels that rays are in: where in the words they are, and the eye from their middles. Rays that have ended
+    are in any voxel."""
+    dx, dy, dz, t, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.word
+    eye_x, eye_y, eye_z = lanes.eye_x, lanes.eye_y, lanes.eye_z
+    x, y, z = grid.eye_x - f32(0.5), grid.eye_y - f32(0.5), grid.eye_z - f32(0.5)
     for k in range(u64(count)):
-        at = min(max(t[k], f32(0.0)), leave[k])
         a, b, c = (
-            _cell(grid.eye_x, dx[k], at, grid.nx),
-            _cell(grid.eye_y, dy[k], at, grid.ny),
-            _cell(grid.eye_z, dz[k], at, grid.nz),
+            _cell(grid.eye_x, dx[k], t[k], grid.nx),
+            _cell(grid.eye_y, dy[k], t[k], grid.ny),
+            _cell(grid.eye_z, dz[k], t[k], grid.nz),
         )
+        eye_x[k], eye_y[k], eye_z[k] = x - a, y - b, z - c
         octant = i32(i32(4) * i32(dx[k] < f32(0.0)) + i32(2) * i32(dy[k] < f32(0.0)) + i32(dz[k] < f32(0.0)))
         word[k] = grid.first + octant * grid.voxels + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
 
@@ -263,22 +270,20 @@ def _look_up(words, lanes, count):
 
 
 @_within
-def _advance(grid, lanes, count):
+def _advance(lanes, count):
     """One step of every ray: test its voxel, and go on to where the empty box ahead of it ends. A ray that has met a
     surface at depth z holds -z from then on."""
-    zero, half = f32(0.0), f32(0.5)
+    half = f32(0.5)
     dx, dy, dz, t, leave, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.word
+    eye_x, eye_y, eye_z = lanes.eye_x, lanes.eye_y, lanes.eye_z
     for k in range(u64(count)):
-        a, b, c, now, end, w = dx[k], dy[k], dz[k], t[k], leave[k], word[k]
-        at = min(max(now, zero), end)
-        # The eye, from the middle of the voxel.
-        ra = grid.eye_x - _cell(grid.eye_x, a, at, grid.nx) - half
-        rb = grid.eye_y - _cell(grid.eye_y, b, at, grid.ny) - half
-        rc = grid.eye_z - _cell(grid.eye_z, c, at, grid.nz) - half
+        a, b, c, at, w = dx[k], dy[k], dz[k], t[k], word[k]
+        ra, rb, rc = eye_x[k], eye_y[k], eye_z[k]
         empty = w < i32(EMPTY)
-        reach_a = f32((w >> i32(16)) & i32(255)) - half if empty else half
-        reach_b = f32((w >> i32(8)) & i32(255)) - half if empty else half
-        reach_c = f32(w & i32(255)) - half if empty else half
+        sides = w if empty else i32(0x010101)
+        reach_a = f32((sides >> i32(16)) & i32(255)) - half
+        reach_b = f32((sides >> i32(8)) & i32(255)) - half
+        reach_c = f32(sides & i32(255)) - half
         ia, ib, ic = f32(1.0) / a, f32(1.0) / b, f32(1.0) / c
         la, lb, lc = abs(ia), abs(ib), abs(ic)
         out = min(reach_a * la - ra * ia, min(reach_b * lb - rb * ib, reach_c * lc - rc * ic))
@@ -291,7 +296,7 @@ def _advance(grid, lanes, count):
         then = max(out, at) + f32(NUDGE) * min(la, min(lb, lc))
         then = -meet if (not empty and far <= f32(0.5 + INFLATION) and meet > f32(NEAR)) else then
         then = -at if w == i32(0) else then
-        t[k] = then if (now >= zero and now < end) else now
+        t[k] = then if (at >= f32(0.0) and at < leave[k]) else at
 
 
 @_within
@@ -338,7 +343,7 @@ def _walk(words, grid, lanes, count, most, met, patch):
             full = _whole_vectors(count)
             _find(grid, lanes, full)
             _look_up(words, lanes, full)
-            _advance(grid, lanes, full)
+            _advance(lanes, full)
         left, steps = left - steps, _STEPS
         count = _make_room(lanes, count, met, patch)
         if left <= 0:
@@ -425,8 +430,8 @@ def _new_lanes(count):
     """Lanes whose rays have left."""
     one = np.ones(count, np.float32)
     nowhere = np.full(count, f32(-1.0))
-    zeros = np.zeros(count, np.int32)
-    return Lanes(one, one.copy(), one.copy(), np.zeros(count, np.float32), nowhere, zeros, zeros.copy())
+    zeros, here = np.zeros(count, np.int32), np.zeros(count, np.float32)
+    return Lanes(one, one.copy(), one.copy(), here, nowhere, zeros, zeros.copy(), here.copy(), here.copy(), here.copy())
 
 
 @_allocates
@@ -550,7 +555,7 @@ def _eye(pose, origin, axis):
     return -(pose[axis] * pose[3] + pose[4 + axis] * pose[7] + pose[8 + axis] * pose[11]) - origin[axis]
 
 
-@_whole
+@_within
 def _draw_object(things, thing, k, picture, patch, stride, shift, space):
     """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
     kind, pose, turn, lanes = things.kind[thing], things.pose[12 * thing : 12 * thing + 12], space.turn, space.lanes
@@ -869,7 +874,7 @@ def _sum_of_logs(p, odds, at):
     return total
 
 
-@_whole
+@_within
 def _outlines(things, n, objects, picture, space):
     """Finds where a hypothesis' objects are in the image. Returns the rectangle around them."""
     u0, u1, v0, v1 = len(picture.ray_x), 0, len(picture.ray_y), 0
@@ -891,7 +896,7 @@ def _outlines(things, n, objects, picture, space):
     return u0, u1, v0, v1
 
 
-@_whole
+@_within
 def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
     """The objects whose outlines have been found, into a patch that holds them."""
     for k in range(objects):
