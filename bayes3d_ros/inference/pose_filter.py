@@ -43,7 +43,7 @@ _KEEP = 0.1  # share of a round's draws that stay effective when they are weighe
 _WIDEN = 1.2  # of the scale learned from a round, for the next
 _ANCESTORS = 32  # of the particles, that draws may have moved from
 _NOISE_LEVELS = 3  # coarse sigmas that draws are scored at: of pixels there are enough to tell sigma to a tenth
-_ALIGNED = 64  # pixels across, at most, of the images that alignment looks at: slopes are of whole images
+_ALIGNED = 34  # pixels across, at most, of the images that alignment looks at: with more it is surer than voxels allow
 _FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
 _SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
 
