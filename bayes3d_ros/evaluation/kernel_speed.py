@@ -138,7 +138,8 @@ def rows() -> Iterator[SpeedRow]:
         ycb_library((name,), Path(folder), VOXEL)
         for size in SIZES:
             compared = _compared(size)
-            turns = {case: _turn(case, Path(folder), mesh) for case in compared if case[0] != "score"}
+            works = {number: workload(size, number, Path(folder)) for number in {case[3] for case in compared}}
+            turns = {case: _turn(case, works[case[3]], mesh) for case in compared if case[0] != "score"}
             seconds = _in_turn(turns)
             for case in compared:
                 if case[0] == "score":  # one kernel does both: what scoring adds, at the least
@@ -155,10 +156,9 @@ def row(what: str, backend: str, size: int, number: int, seconds: Sequence[float
     return speed_row(what, backend, device, size, number, seconds)
 
 
-def _turn(case: tuple[str, str, int, int], library_folder: Path, mesh: trimesh.Trimesh) -> Callable[[], list[float]]:
+def _turn(case: tuple[str, str, int, int], work: Workload, mesh: trimesh.Trimesh) -> Callable[[], list[float]]:
     """Measures a case once more: seconds of one or more calls. Compiled and warm."""
-    what, backend, size, number = case
-    work = workload(size, number, library_folder)
+    what, backend = case[:2]
     if backend not in ("ours", "plain-jax"):
         scene = peers.RAY_CASTERS[backend](mesh)
         _cast(scene, work)
@@ -211,6 +211,7 @@ def _in_object(
 
 
 def _times(call: Callable[[], Any]) -> list[float]:
+    """Seconds of the calls of a turn."""
     seconds: list[float] = []
     while not seconds or (sum(seconds) < _AT_LEAST and len(seconds) < _MOST_REPEATS):
         start = time.perf_counter()

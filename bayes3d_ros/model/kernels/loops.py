@@ -567,12 +567,15 @@ def _draw_object(things, thing, k, picture, patch, stride, shift, space):
         _fill(space.left, v1, f32(0.0))
         _fill(space.right, v1, f32(u1))
     else:
-        edges = things.hull_edge[2 * EDGES * kind : 2 * EDGES * (kind + 1)]
-        corner_u, corner_v = (
+        _cut_rows(
+            things.hull_edge[2 * EDGES * kind : 2 * EDGES * (kind + 1)],
             space.corner_u[CORNERS * k : CORNERS * (k + 1)],
             space.corner_v[CORNERS * k : CORNERS * (k + 1)],
+            v0,
+            v1,
+            space.left,
+            space.right,
         )
-        _cut_rows(edges, corner_u, corner_v, v0, v1, space.left, space.right)
     scale = f32(1.0) / things.size[kind]
     for axis in range(3):
         for row in range(3):
@@ -943,7 +946,7 @@ def _gains(
     gain, space, windows, now, former
 ):  # fmt: skip
     count, border = len(planes) // 4, window // 2
-    objects, levels = len(things.kind) // count, len(sigma) * len(p_outlier)
+    objects, levels = _objects(things, planes), len(sigma) * len(p_outlier)
     with_scenes = len(scenes) > 0
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
@@ -995,7 +998,7 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
     """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
     with, or none, and what each hypothesis adds."""
     count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
-    objects = len(things.kind) // count
+    objects = _objects(things, planes)
     for n in range(count):
         image = depth[n * pixels : (n + 1) * pixels]
         for k in range(pixels):
@@ -1007,6 +1010,12 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
         _draw_objects(things, n, objects, picture, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
+
+
+@_whole
+def _objects(things, planes):
+    """How many objects a hypothesis has; every hypothesis has one plane."""
+    return len(things.kind) // max(len(planes) // 4, 1)
 
 
 @_whole
@@ -1038,7 +1047,7 @@ def _gain(frame):
     _gains(
         things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
         numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2, len(things.kind) // max(len(planes) // 4, 1)),
+        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2, _objects(things, planes)),
         _new_windows(window * window),
         np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
     )  # fmt: skip
@@ -1058,7 +1067,7 @@ def _depth(frame):
     )  # fmt: skip
     _depths(
         things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), 0, len(things.kind) // max(len(planes) // 4, 1)),
+        _new_space(len(picture.ray_y), len(picture.ray_x), 0, _objects(things, planes)),
     )  # fmt: skip
     return 0
 
