@@ -216,7 +216,8 @@ def track(
     """Follow the camera of BAG around what its first frame shows, or around a known world."""
     from bayes3d_ros.bags import read_frames
     from bayes3d_ros.evaluation.tracking_results import PICTURE, TrackWriter, plot_track
-    from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
+    from bayes3d_ros.inference.camera_following import CameraFollower
+    from bayes3d_ros.inference.camera_tracking import CameraTracker, Tracking
     from bayes3d_ros.inference.compilation import enable_cache, every_core
     from bayes3d_ros.inference.scene_parsing import SceneParser
     from bayes3d_ros.inference.settings import TrackerSettings

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from bayes3d_ros import cli
 from bayes3d_ros.bags import BagWriter
-from bayes3d_ros.inference import camera_tracking, scene_parsing
+from bayes3d_ros.inference import camera_following, camera_tracking, scene_parsing
 from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import load_library, save_model
@@ -317,7 +317,7 @@ def followers(monkeypatch, parsers):
             )  # fmt: skip
 
     monkeypatch.setattr(camera_tracking, "CameraTracker", Tracker)
-    monkeypatch.setattr(camera_tracking, "CameraFollower", Follower)
+    monkeypatch.setattr(camera_following, "CameraFollower", Follower)
     return told
 
 

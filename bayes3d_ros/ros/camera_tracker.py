@@ -21,7 +21,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker, Tracking
+from bayes3d_ros.inference.camera_following import CameraFollower
+from bayes3d_ros.inference.camera_tracking import CameraTracker, Tracking
 from bayes3d_ros.inference.compilation import enable_cache, every_core
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import TrackerSettings
@@ -42,7 +43,7 @@ _INPUT_PARAMETERS = ("qos_reliability", "table_frame", "camera_pose", "patience"
 
 
 class Follower(Protocol):
-    """What the node needs of a tracker; see inference/camera_tracking.py."""
+    """What the node needs of a tracker; see inference/camera_following.py."""
 
     def step(self, known: Tracking | None, frame, /) -> tuple[Tracking, CameraEstimate]: ...
 

@@ -15,8 +15,9 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.inference import camera_tracking, pose_filter
 from bayes3d_ros.inference.camera_errors import pose_covariance
+from bayes3d_ros.inference.camera_following import CameraFollower
 from bayes3d_ros.inference.camera_search import LookAt, over_table
-from bayes3d_ros.inference.camera_tracking import CameraFollower, CameraTracker
+from bayes3d_ros.inference.camera_tracking import CameraTracker
 from bayes3d_ros.inference.registration import SmoothError
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import KnownWorld, TrackingError

@@ -1,0 +1,67 @@
+"""Start a camera's tracker, and find the camera again when it is lost."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.geometry.poses import pose_matrix
+from bayes3d_ros.inference.camera_tracking import CameraTracker, Tracking
+from bayes3d_ros.inference.scene_parsing import SceneParser
+from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.model.posterior import ParseError, ScenePosterior
+
+
+class CameraFollower:
+    """A tracker with a parser, which finds the world in the first frame and the camera when it is lost. In a world
+    that is known beforehand the first pose is the recorded one, or else looked for, as it is where parsing does not
+    help."""
+
+    def __init__(self, tracker: CameraTracker, parser: SceneParser, world: KnownWorld | None = None) -> None:
+        """Raises WorldError for a world without objects, or with ones that the library lacks."""
+        self.tracker, self.parser = tracker, parser
+        self._told = None if world is None else tracker.start(world, np.eye(4))
+
+    def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        """One frame, the first one where nothing is known yet. Raises TrackingError or ParseError, and then what was
+        known still is."""
+        if known is None:
+            return self._first(frame)
+        longest = self.tracker.settings.longest_gap
+        late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > longest
+        if not late:
+            now, estimate = self.tracker.step(known, frame)
+            if not estimate.lost:
+                return now, estimate
+        try:
+            now, estimate = self.tracker.step(self.tracker.relocalise(known, self.parser.parse(frame), frame), frame)
+        except (TrackingError, ParseError):
+            if self._told is None:
+                raise
+            return self._looked_for(known, frame)
+        if estimate.lost and self._told is not None:
+            return self._looked_for(known, frame)
+        return now, replace(estimate, found_again=True)
+
+    def _first(self, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        if self._told is None:
+            world, T_world_camera = world_of(self.parser.parse(frame), self.tracker.settings.table)
+            now, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
+            return now, replace(estimate, found_again=True)
+        if frame.T_table_camera is not None:
+            now, estimate = self.tracker.step(self.tracker.start(self._told.world, frame.T_table_camera), frame)
+            if not estimate.lost:
+                return now, estimate
+        return self._looked_for(self._told, frame)
+
+    def _looked_for(self, known: Tracking, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+        now, estimate = self.tracker.step(self.tracker.look_for(known, frame), frame)
+        return now, replace(estimate, found_again=True)
+
+
+def world_of(posterior: ScenePosterior, table: bool) -> tuple[KnownWorld, Float[np.ndarray, "4 4"]]:
+    """The objects of a parsed scene at rest in the table's frame, and T_world_camera."""
+    T_world_camera = np.linalg.inv(posterior.T_camera_table)
+    placed = np.array([T_world_camera @ pose_matrix(o.position, o.orientation) for o in posterior.objects])
+    return KnownWorld(tuple(o.type for o in posterior.objects), placed.reshape(-1, 4, 4), table), T_world_camera
