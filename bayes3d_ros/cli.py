@@ -356,8 +356,6 @@ def _write_json(file: Path, content: Any) -> None:
 @_device_option
 def bench(file: Path | None) -> None:
     """Measure how fast this machine is."""
-    import json
-
     from bayes3d_ros.evaluation import benchmark, kernel_speed, tracking_speed
     from bayes3d_ros.evaluation.speed_rows import growth
     from bayes3d_ros.inference.compilation import enable_cache, every_core
@@ -371,7 +369,7 @@ def bench(file: Path | None) -> None:
 
     def write() -> None:
         if file is not None:
-            file.write_text(json.dumps(report, indent=1) + "\n")
+            _write_json(file, report)
 
     def measure(section: Any) -> None:
         click.echo(section.HEADER)
