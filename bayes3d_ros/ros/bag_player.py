@@ -18,7 +18,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
-from bayes3d_ros.ros.spinning import shut_down
+from bayes3d_ros.ros.spinning import shut_down, until_stopped
 from bayes3d_ros.ros.transport import use_large_messages
 
 CLOCK_PERIOD = 0.01  # seconds of real time
@@ -155,24 +155,20 @@ def main(args: list[str] | None = None) -> int:
     arguments = _arguments(remove_ros_args(argv)[1:])
     status = 0
     try:
-        use_large_messages()
-        rclpy.init(args=argv)
-        player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
-        player.wait_for_subscribers(arguments.wait)
-        while True:
-            played = player.play(arguments.rate)
-            player.get_logger().info(f"played {played} messages of {arguments.bag}")
-            if not arguments.loop:
-                break
-        player.finish(ACKNOWLEDGED_SECONDS)
+        with until_stopped():
+            use_large_messages()
+            rclpy.init(args=argv)
+            player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
+            player.wait_for_subscribers(arguments.wait)
+            while True:
+                played = player.play(arguments.rate)
+                player.get_logger().info(f"played {played} messages of {arguments.bag}")
+                if not arguments.loop:
+                    break
+            player.finish(ACKNOWLEDGED_SECONDS)
     except BagError as error:
         sys.stderr.write(f"bag_player: {error}\n")
         status = 1 if isinstance(error, BagDamage) else 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        if rclpy.ok():  # a signal between two calls of rclpy leaves the second one without a context
-            raise
     finally:
         shut_down()
     return status

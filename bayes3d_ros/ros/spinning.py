@@ -3,7 +3,8 @@
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol, cast
 
 import rclpy
@@ -26,28 +27,13 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     """Spin a node until SIGINT, SIGTERM or a shutdown of ROS; the exit status is 0 for all of them."""
     node = None
     stopped = True
-    interrupted = False
-
-    def interrupt(number: int, frame: object) -> None:
-        nonlocal interrupted
-        interrupted = True
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, interrupt)
     try:
-        use_large_messages()
-        rclpy.init(args=args)
-        node = make_node()
-        rclpy.spin(cast(Node, node))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # A signal between two calls of rclpy leaves the second one without a context; one while a message is taken
-        # comes out as another exception.
-        if rclpy.ok() and not interrupted:
-            raise
+        with until_stopped():
+            use_large_messages()
+            rclpy.init(args=args)
+            node = make_node()
+            rclpy.spin(cast(Node, node))
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean end short
         if node is not None:
             stopped = node.stop(timeout=2.0)
             cast(Node, node).destroy_node()
@@ -58,6 +44,33 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
         sys.stderr.flush()
         os._exit(0)
     return 0
+
+
+@contextmanager
+def until_stopped() -> Iterator[None]:
+    """Work that SIGINT, SIGTERM or a shutdown of ROS ends, without an exception. SIGINT is ignored from then on: launch
+    and a terminal both send one for the same Ctrl-C, and the second must not cut the clean end short."""
+    ended = False
+
+    def interrupt(number: int, frame: object) -> None:
+        nonlocal ended
+        if not ended:
+            ended = True
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # A signal between two calls of rclpy leaves the second one without a context; one while a message is taken
+        # comes out as another exception.
+        if rclpy.ok() and not ended:
+            raise
+    finally:
+        ended = True
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def shut_down(context: Context | None = None) -> None:
