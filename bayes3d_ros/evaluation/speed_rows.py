@@ -31,8 +31,8 @@ def speed_row(
 
 def growth(rows: Sequence[SpeedRow]) -> dict[str, float]:
     """How many times the cost of more of something is that of less, over how many times as much of it there is: at most
-    1 where cost grows linearly. Of hypotheses (ours, render+score, from 256 on), of objects on one table, of the
-    library's types; and how many times the memory of a few frames many take."""
+    1 where cost grows linearly. Of hypotheses (ours, render+score, from 256 on), of objects on one table (the mean of
+    tables with as many), of the library's types; and how many times the memory of a few frames many take."""
     told = {}
     scored = [r for r in rows if (r["what"], r["backend"]) == ("render+score", "ours") and r["hypotheses"] >= 256]
     for size in dict.fromkeys(r["size"] for r in scored):
@@ -40,7 +40,8 @@ def growth(rows: Sequence[SpeedRow]) -> dict[str, float]:
             name = f"seconds a hypothesis, {more['hypotheses']} / {less['hypotheses']}, {size} pixels"
             told[name] = _relative(less, more, "hypotheses")
     parsed = [r for r in rows if r["what"] == "parse"]
-    for less, more in _neighbours([r for r in parsed if r["bag"].startswith(FILLED_TABLE)], "objects"):
+    tables = [r for r in parsed if r["bag"].startswith(FILLED_TABLE)]
+    for less, more in _neighbours(_means(tables, "objects"), "objects"):
         told[f"seconds an object, {more['objects']} / {less['objects']}"] = _relative(less, more, "objects")
     for bag in dict.fromkeys(r["bag"] for r in parsed):
         for less, more in _neighbours([r for r in parsed if r["bag"] == bag], "library"):
@@ -52,6 +53,12 @@ def growth(rows: Sequence[SpeedRow]) -> dict[str, float]:
                 r["peak_mib"] / r["peak_mib_at_first"], 3
             )
     return told
+
+
+def _means(rows: Sequence[SpeedRow], by: str) -> list[SpeedRow]:
+    """One row for every value of a number: it and the mean of the seconds."""
+    values = dict.fromkeys(r[by] for r in rows)
+    return [{by: value, "seconds": float(np.mean([r["seconds"] for r in rows if r[by] == value]))} for value in values]
 
 
 def _neighbours(rows: Sequence[SpeedRow], by: str) -> list[tuple[SpeedRow, SpeedRow]]:

@@ -72,7 +72,7 @@ def test_cases_are_bags_that_exist(tmp_path, monkeypatch):
     (tmp_path / "real_sugar_box").mkdir()
     real = [(case.bag.name, len(case.types)) for case in benchmark.cases()[len(bundled) :]]
     assert real == [("real_sugar_box", 1), ("real_sugar_box", 10)]
-    assert benchmark.count() == len(bundled) + 9
+    assert benchmark.count() == len(bundled) + 12
 
 
 def test_the_machine_and_the_versions_are_named():

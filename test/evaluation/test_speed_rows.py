@@ -30,7 +30,8 @@ def test_growth_is_one_where_cost_is_linear():
         parsed("one_object", 10, 1, 2.0),
         parsed("three_objects", 10, 3, 12.0),
         parsed("table_of_1", 10, 1, 2.0),
-        parsed("table_of_4", 10, 4, 6.0),
+        parsed("table_of_4", 10, 4, 5.0),
+        parsed("table_of_4_from_last", 10, 4, 7.0),
         parsed("real_clutter", 10, 5, 99.0),
         speed_row("memory", "ours", "cpu", "8x6", None, [1.0], **peaks),
     ]
