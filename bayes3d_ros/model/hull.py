@@ -1,28 +1,64 @@
-"""A convex solid around an object that is tighter than its box: the box with its twelve edges cut off."""
+"""The convex solid around all that rays can meet of an object: what its outline in an image is found by."""
 
 import itertools
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-CORNERS, EDGES = 32, 48  # the most that a solid of 18 faces has
+MOST_CORNERS = 512
 
-# Outward normals of the faces: along the axes, and half way between two of them.
-_NORMALS = np.array([n for n in itertools.product((-1, 0, 1), repeat=3) if 0 < np.count_nonzero(n) < 3], float)
+_CUBE = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
-def hull(cells: Int[np.ndarray, "S 3"]) -> tuple[Float[np.ndarray, "32 3"], Int[np.ndarray, "48 2"]]:
-    """Corners, in voxels, and edges, as two corners each, of the solid around some cells of a voxel grid. What is not
-    needed of the 32 and 48 repeats the first corner."""
-    reach = (cells @ _NORMALS.T).max(0) + np.maximum(_NORMALS, 0).sum(1)
-    threes = np.array(list(itertools.combinations(range(len(_NORMALS)), 3)))
-    meet = np.abs(np.linalg.det(_NORMALS[threes])) > 0.5
-    points = np.linalg.solve(_NORMALS[threes[meet]], reach[threes[meet]][..., None])[..., 0]
-    corners = np.unique(points[(points @ _NORMALS.T <= reach + 1e-6).all(1)].round(3), axis=0)
-    # Two corners that lie on the same two faces are the ends of an edge.
-    on = np.abs(corners @ _NORMALS.T - reach) < 1e-2
-    ends = np.argwhere(np.triu(on.astype(int) @ on.T >= 2, 1))
-    return (
-        np.concatenate([corners, np.repeat(corners[:1], CORNERS - len(corners), 0)]),
-        np.concatenate([ends, np.zeros((EDGES - len(ends), 2), int)]),
-    )
+def hull(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "C 3"]:
+    """Corners of a convex solid that holds some points: of the least one, or, where that has more than MOST_CORNERS, of
+    the least with faces in as many directions as will do."""
+    corners = _extreme(points)
+    if len(corners) <= MOST_CORNERS:
+        return corners
+    directions = _directions((MOST_CORNERS + 4) // 2)  # Euler: a solid of F faces has 2 F - 4 corners at most
+    sides = np.column_stack([directions, -(corners @ directions.T).max(0)])
+    return np.unique(HalfspaceIntersection(sides, corners.mean(0)).intersections, axis=0)
+
+
+def _directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Spread evenly: a spiral from pole to pole (Gonzalez, Measurement of areas on a sphere using Fibonacci lattices,
+    2010), and the axes."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    place = np.arange(count - len(axes)) + 0.5
+    z, turn = 1 - 2 * place / len(place), np.pi * (3 - np.sqrt(5)) * place
+    spiral = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    return np.concatenate([axes, spiral])
+
+
+def _extreme(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "C 3"]:
+    """The corners of points' convex hull; all of them, at worst, where they lie in a plane or on a line."""
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        low, high = points.min(0), points.max(0)
+        return low + _CUBE * (high - low)
+
+
+def cube_corners(cells: Int[np.ndarray, "S 3"]) -> Float[np.ndarray, "P 3"]:
+    """The corners of voxels, in voxels."""
+    return (cells[:, None] + _CUBE).reshape(-1, 3).astype(float)
+
+
+def patch_corners(
+    cells: Int[np.ndarray, "S 3"], normal: Float[np.ndarray, "S 3"], offset: Float[np.ndarray, "S"], reach: float
+) -> Float[np.ndarray, "P 3"]:
+    """The corners, in voxels, of what lies of a voxel's plane within `reach` of its middle along every axis. The plane
+    is normal . x = offset, from the middle."""
+    corners = []
+    for axis in range(3):
+        sides = [a for a in range(3) if a != axis]
+        for edge in itertools.product((-reach, reach), repeat=2):
+            point = np.empty((len(cells), 3))
+            point[:, sides] = edge
+            with np.errstate(divide="ignore", invalid="ignore"):
+                point[:, axis] = (offset - normal[:, sides] @ edge) / normal[:, axis]
+            crosses = np.abs(point[:, axis]) <= reach
+            corners.append((cells + 0.5 + point)[crosses])
+    return np.concatenate(corners)

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.model.empty_boxes import empty_boxes
-from bayes3d_ros.model.hull import hull
+from bayes3d_ros.model.hull import MOST_CORNERS, cube_corners, hull, patch_corners
 from bayes3d_ros.model.lookalikes import lookalikes
 from bayes3d_ros.model.objects import Library, LibraryError, ObjectModel
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
+INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
 SKETCH_POINTS = 96  # surface points a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
@@ -37,8 +38,8 @@ class LibraryArrays(NamedTuple):
     origin: Float[Array, "K 3"]
     T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
     face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
-    hull_corner: Float[Array, "K 32 3"]  # of a convex solid around the object (`hull.py`), object frame
-    hull_edge: Int[Array, "K 48 2"]
+    hull_corner: Float[Array, "K 3 C"]  # of a convex solid around all that rays meet (`hull.py`), object frame
+    hull_corners: Int[Array, "K"]  # how many those are; the rest repeats one of them
     radius: Float[Array, "K"]  # of a ball about the box centre
     sketch: Float[Array, "K P 3"]  # surface points, object frame
     sketch_normal: Float[Array, "K P 3"]
@@ -77,11 +78,26 @@ def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
     solid = _solid(model)
     boxes = empty_boxes(solid).astype(np.uint32)
     words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
-    normal = np.rint(model.surface_normal * 127).astype(np.int64)
-    offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
+    normal, offset = _planes(model)
     plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
     words[:, *model.surface_index.T] = plane
     return words.view(np.int32)
+
+
+def _planes(model: ObjectModel) -> tuple[Int[np.ndarray, "S 3"], Int[np.ndarray, "S"]]:
+    """The surface's normals, 127 long, and offsets, 127 of which are OFFSET_RANGE voxels."""
+    normal = np.rint(model.surface_normal * 127).astype(np.int64)
+    offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
+    return normal, offset
+
+
+def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
+    """A convex solid around all that rays can meet, in voxels: planes in their inflated cubes, and voxels inside."""
+    inside = model.occupancy.copy()
+    inside[tuple(model.surface_index.T)] = False
+    normal, offset = _planes(model)
+    planes = patch_corners(model.surface_index, normal / 127, offset / 127 * OFFSET_RANGE, 0.5 + INFLATION)
+    return hull(np.concatenate([planes, cube_corners(np.argwhere(inside))]))
 
 
 def library_arrays(library: Library) -> LibraryArrays:
@@ -90,7 +106,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     count = len(models)
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
     sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
-    hulls = [hull(np.argwhere(_solid(m))) for m in models]
+    hulls = [m.origin + _hull(m) * m.voxel_size for m in models]
     grids = [pack_voxels(m).ravel() for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
     alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
@@ -113,8 +129,8 @@ def library_arrays(library: Library) -> LibraryArrays:
         origin=stack([m.origin for m in models]),
         T_contact_object=stack(T_contact_object),
         face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
-        hull_corner=stack([m.origin + h[0] * m.voxel_size for m, h in zip(models, hulls, strict=True)]),
-        hull_edge=stack([h[1] for h in hulls], np.int32),
+        hull_corner=stack([np.pad(h, ((0, MOST_CORNERS - len(h)), (0, 0)), "edge").T for h in hulls]),
+        hull_corners=stack([np.array(len(h)) for h in hulls], np.int32),
         radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
         sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
         sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),

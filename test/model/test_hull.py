@@ -1,39 +1,92 @@
-"""The solid around an object: it holds every voxel, every face touches some, and its edges are a polyhedron's."""
+"""The solid around an object: it holds all that rays meet, and is no larger than that asks for."""
 
 import itertools
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import ConvexHull
 
-from bayes3d_ros.model.hull import CORNERS, EDGES, hull
-
-CUBE = np.array(list(itertools.product((0, 1), repeat=3)))
-DIRECTIONS = np.array([n for n in itertools.product((-1, 0, 1), repeat=3) if 0 < np.count_nonzero(n) < 3])
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 50, 500])
-@pytest.mark.parametrize("seed", range(5))
-def test_it_holds_the_cells_and_no_more(count, seed):
-    rng = np.random.default_rng(seed)
-    cells = rng.integers(0, rng.integers(1, 30, 3), (count, 3))
-    corners, edges = hull(cells)
-    assert corners.shape == (CORNERS, 3) and edges.shape == (EDGES, 2)
-    of_cells = (cells[:, None] + CUBE).reshape(-1, 3)
-    # How far it reaches is how far the cells reach, in the directions of its faces.
-    assert np.allclose((corners @ DIRECTIONS.T).max(0), (of_cells @ DIRECTIONS.T).max(0))
-    solid = ConvexHull(np.unique(corners, axis=0))
-    assert (solid.equations[:, :3] @ of_cells.T <= 1e-6 - solid.equations[:, 3:]).all()
+from bayes3d_ros.model.hull import MOST_CORNERS, cube_corners, hull, patch_corners
+from bayes3d_ros.model.library_arrays import library_arrays
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import Library
+from bayes3d_ros.model.rendering.voxel_march import march
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 50, 500])
-def test_edges(count):
-    """Euler's formula, and every corner is the end of three edges at the least."""
-    cells = np.random.default_rng(count).integers(0, (12, 20, 9), (count, 3))
-    corners, edges = hull(cells)
-    number = len(np.unique(corners, axis=0))
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    assert len(np.unique(edges, axis=0)) == len(edges)
-    faces = len(np.unique(ConvexHull(corners[:number]).equations.round(4), axis=0))
-    assert number - len(edges) + faces == 2
-    assert (np.bincount(edges.ravel(), minlength=number) >= 3).all()
+def outside(points, corners):
+    """How far the farthest of some points lies outside a solid."""
+    sides = ConvexHull(corners).equations
+    return (points @ sides[:, :3].T + sides[:, 3]).max()
+
+
+@pytest.mark.parametrize("count", [4, 5, 50, 5000])
+def test_the_least_solid_where_it_has_few_corners(count):
+    points = np.random.default_rng(count).integers(0, 12, (count, 3)) * [1.0, 2.0, 0.5]
+    corners = hull(points)
+    assert len(corners) <= MOST_CORNERS and outside(points, corners) < 1e-9
+    assert {tuple(c) for c in corners} <= {tuple(p) for p in points}
+
+
+@pytest.mark.parametrize("radius", [20.0, 200.0])
+def test_a_larger_one_where_it_has_too_many(radius):
+    points = np.random.default_rng(0).normal(size=(20_000, 3))
+    points *= radius / np.linalg.norm(points, axis=1, keepdims=True)
+    assert len(ConvexHull(points).vertices) > MOST_CORNERS
+    corners = hull(points)
+    assert len(corners) <= MOST_CORNERS and outside(points, corners) < 1e-6 * radius
+    assert np.linalg.norm(corners, axis=1).max() < 1.02 * radius
+
+
+@pytest.mark.parametrize("flat", [(1, 1, 0), (1, 0, 0), (0, 0, 0)])
+def test_what_is_flat_is_held_as_well(flat):
+    points = np.random.default_rng(1).uniform(-3, 5, (30, 3)) * flat + [7, 0, -2]
+    corners = hull(points)
+    assert (corners.min(0) <= points.min(0)).all() and (corners.max(0) >= points.max(0)).all()
+    assert np.allclose(np.ptp(corners, 0), np.ptp(points, 0))
+
+
+def test_cubes():
+    assert {tuple(c) for c in cube_corners(np.array([[2, 0, -1]]))} == set(itertools.product((2, 3), (0, 1), (-1, 0)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_patches_are_the_planes_within_reach(seed):
+    """Points of a plane are between the corners of its patch, as far as they are within reach."""
+    rng, reach = np.random.default_rng(seed), 0.7
+    normal = rng.normal(size=3) * ([1, 1, 0] if seed == 3 else 1)
+    normal /= np.linalg.norm(normal)
+    cell, offset = rng.integers(0, 9, 3), rng.uniform(-0.5, 0.5)
+    corners = patch_corners(cell[None], normal[None], np.array([offset]), reach) - cell - 0.5
+    assert np.allclose(corners @ normal, offset) and (np.abs(corners) <= reach + 1e-9).all()
+    points = rng.uniform(-reach, reach, (2000, 3))
+    points -= (points @ normal - offset)[:, None] * normal
+    points = points[(np.abs(points) <= reach).all(1)]
+    thick = np.concatenate([corners + 1e-6 * normal, corners - 1e-6 * normal])
+    assert len(points) > 100 and outside(points, thick) < 1e-9
+
+
+@pytest.mark.parametrize("shape", ["box", "ball", "plate", "ring"])
+def test_rays_meet_nothing_outside(shape):
+    mesh = {
+        "box": lambda: trimesh.creation.box((0.06, 0.09, 0.03)),
+        "ball": lambda: trimesh.creation.icosphere(radius=0.05),
+        "plate": lambda: trimesh.creation.box((0.1, 0.08, 0.004)),
+        "ring": lambda: trimesh.creation.torus(0.05, 0.012),
+    }[shape]()
+    model = model_from_mesh(mesh, shape, 0.005)
+    library = library_arrays(Library((model,)))
+    rng = np.random.default_rng(0)
+    turns = trimesh.transformations.random_rotation_matrix
+    T = np.stack([turns(rng.random(3)) for _ in range(40)]).astype(np.float32)
+    T[:, 2, 3] = 0.4
+    x, y = (np.ravel(a).astype(np.float32) for a in np.meshgrid(*2 * (np.linspace(-0.25, 0.25, 61),)))
+    depth = np.array(march(library, np.zeros(40, int), T, (x[:, None], y[:, None])))
+    pixel, pose = np.nonzero(np.isfinite(depth))
+    assert len(pixel) > 5000
+    met = depth[pixel, pose, None] * np.stack([x[pixel], y[pixel], np.ones(len(pixel))], -1)
+    met = np.einsum("nba,nb->na", T[pose, :3, :3], met - T[pose, :3, 3])
+    corners = np.asarray(library.hull_corner[0]).T[: int(library.hull_corners[0])]
+    assert outside(met, corners) < 1e-5
+    # Corners are met by some ray, give or take what planes go on beyond their cubes.
+    assert ConvexHull(corners).volume < 1.4 * ConvexHull(met).volume

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from bayes3d_ros.model.library_arrays import INFLATION
 from bayes3d_ros.model.objects import ObjectModel
-from bayes3d_ros.model.rendering.voxel_march import INFLATION
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
 _AT_A_TIME = 256  # rays, which bounds memory

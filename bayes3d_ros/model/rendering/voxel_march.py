@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.model.library_arrays import EMPTY, OFFSET_RANGE, LibraryArrays
+from bayes3d_ros.model.library_arrays import EMPTY, INFLATION, OFFSET_RANGE, LibraryArrays
 
-INFLATION = 0.2  # voxels
 NEAR = 0.05  # metres: nothing is met before
 _FIRST_STEPS = 4  # of all rays alike
 # Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
