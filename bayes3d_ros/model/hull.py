@@ -33,7 +33,9 @@ def _directions(count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def _extreme(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "C 3"]:
-    """The corners of points' convex hull; all of them, at worst, where they lie in a plane or on a line."""
+    """The corners of points' convex hull, or of their box where they lie in a plane or on a line."""
+    if not len(points):
+        return np.zeros((1, 3))  # nothing can be met: any solid will do
     try:
         return points[ConvexHull(points).vertices]
     except QhullError:

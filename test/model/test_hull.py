@@ -46,6 +46,12 @@ def test_what_is_flat_is_held_as_well(flat):
     assert np.allclose(np.ptp(corners, 0), np.ptp(points, 0))
 
 
+def test_where_nothing_can_be_met_there_is_a_solid():
+    """A plane so far from its voxel's middle that rays in the voxel never meet it."""
+    missed = patch_corners(np.zeros((1, 3), int), np.eye(3)[:1], np.array([0.8]), 0.7)
+    assert len(missed) == 0 and np.isfinite(hull(missed)).all() and len(hull(missed)) > 0
+
+
 def test_cubes():
     assert {tuple(c) for c in cube_corners(np.array([[2, 0, -1]]))} == set(itertools.product((2, 3), (0, 1), (-1, 0)))
 
