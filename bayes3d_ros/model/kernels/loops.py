@@ -16,7 +16,6 @@ from numba import cfunc, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from bayes3d_ros.model.hull import MOST_CORNERS
 from bayes3d_ros.model.kernels.call_frame import answered_version, float_results, floats, integers, register
 from bayes3d_ros.model.library_arrays import EMPTY, INFLATION, OFFSET_RANGE
 from bayes3d_ros.model.likelihood import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
@@ -459,15 +458,15 @@ def _new_lanes(count):
 
 
 @_allocates
-def _new_space(height, width, border, objects):
+def _new_space(height, width, border, objects, corners):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
     return Space(
         _new_lanes(_LANES + 2 * _VECTOR),
         Met(np.empty(_LANES + _VECTOR, np.float32), np.empty(_LANES + _VECTOR, np.int32)),
         np.empty(9, np.float32),
-        np.empty(MOST_CORNERS, np.float32),
-        np.empty(MOST_CORNERS, np.float32),
+        np.empty(corners, np.float32),
+        np.empty(corners, np.float32),
         np.empty(_SIDES * objects, np.float32),
         np.empty(4 * objects, np.int64),
         np.empty(objects, np.uint8),
@@ -511,7 +510,7 @@ def _new_windows(points):
 @_lanes
 def _project(corners, count, pose, picture, corner_u, corner_v):
     """Where corners are in the image. Returns the least and the largest of depth, column and row."""
-    most = u64(MOST_CORNERS)
+    most = u64(len(corners) // 3)
     near, far, left, right, top, bottom = _INF, -_INF, _INF, -_INF, _INF, -_INF
     for k in range(u64(count)):
         a, b, c = corners[k], corners[most + k], corners[u64(2) * most + k]
@@ -905,13 +904,13 @@ def _sum_of_logs(p, odds, at):
 @_within
 def _outlines(things, n, objects, picture, space):
     """Finds where a hypothesis' objects are in the image. Returns the rectangle around them."""
-    u0, u1, v0, v1 = len(picture.ray_x), 0, len(picture.ray_y), 0
+    u0, u1, v0, v1, corners = len(picture.ray_x), 0, len(picture.ray_y), 0, _most_corners(things)
     for k in range(objects):
         thing = n * objects + k
         kind = things.kind[thing]
         box, space.behind[k] = _outline(
             things.pose[12 * thing : 12 * thing + 12],
-            things.hull_corner[3 * MOST_CORNERS * kind : 3 * MOST_CORNERS * (kind + 1)],
+            things.hull_corner[3 * corners * kind : 3 * corners * (kind + 1)],
             _whole_vectors(things.hull_corners[kind]),
             picture,
             k,
@@ -1044,6 +1043,12 @@ def _objects(things, planes):
 
 
 @_whole
+def _most_corners(things):
+    """How many corners of a hull there is room for."""
+    return len(things.hull_corner) // (3 * len(things.hull_corners))
+
+
+@_whole
 def _is_plane(plane):
     return abs(plane[0] + plane[1] + plane[2] + plane[3]) < _NOTHING  # not NaN
 
@@ -1072,7 +1077,9 @@ def _gain(frame):
     _gains(
         things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
         numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), window // 2, _objects(things, planes)),
+        _new_space(
+            len(picture.ray_y), len(picture.ray_x), window // 2, _objects(things, planes), _most_corners(things)
+        ),
         _new_windows(window * window),
         np.zeros(len(sigma) * _WIDE, np.float32), np.zeros(len(sigma) * _WIDE, np.float32),
     )  # fmt: skip
@@ -1092,7 +1099,7 @@ def _depth(frame):
     )  # fmt: skip
     _depths(
         things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
-        _new_space(len(picture.ray_y), len(picture.ray_x), 0, _objects(things, planes)),
+        _new_space(len(picture.ray_y), len(picture.ray_x), 0, _objects(things, planes), _most_corners(things)),
     )  # fmt: skip
     return 0
 
