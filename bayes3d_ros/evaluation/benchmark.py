@@ -71,11 +71,8 @@ def cases() -> list[Case]:
 
 
 def filled_tables(folder: Path) -> Iterator[Case]:
-    """One frame of the same table with more and more on it, simulated into new bags. From either end of FILLING, as
-    some objects cost more than others."""
-    chosen = {f"{number}": FILLING[:number] for number in FILLED}
-    chosen |= {f"{number}_from_last": FILLING[-number:] for number in FILLED if number < len(FILLING)}
-    for name, filling in chosen.items():
+    """One frame of the same table with more and more on it, simulated into new bags."""
+    for name, filling in _fillings().items():
         things = [{"mesh": mesh, "x": x, "y": y, "yaw": yaw} for mesh, x, y, yaw in filling]
         camera = {"eye": [-0.06, -0.66, 0.5], "target": [0.0, 0.02, 0.04], "frames": 1}
         table = {"size": [1.3, 0.9], "height": 0.74}
@@ -84,9 +81,16 @@ def filled_tables(folder: Path) -> Iterator[Case]:
         yield Case(simulate(scene, scene.with_suffix("")), TEN_TYPES)
 
 
+def _fillings() -> dict[str, tuple[tuple[str, float, float, float], ...]]:
+    """What stands on the tables, by their names' ends: from either end of FILLING, as some objects cost more than
+    others."""
+    from_first = {f"{number}": FILLING[:number] for number in FILLED}
+    return from_first | {f"{number}_from_last": FILLING[-number:] for number in FILLED if number < len(FILLING)}
+
+
 def count() -> int:
     """How many rows `rows` yields."""
-    return len(cases()) + sum(1 + (number < len(FILLING)) for number in FILLED) + 3
+    return len(cases()) + len(_fillings()) + 3
 
 
 def rows() -> Iterator[SpeedRow]:

@@ -39,7 +39,7 @@ class LibraryArrays(NamedTuple):
     T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
     face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
     hull_corner: Float[Array, "K 3 C"]  # of a convex solid around all that rays meet (`hull.py`), object frame
-    hull_corners: Int[Array, "K"]  # how many those are; the rest repeats one of them
+    hull_count: Int[Array, "K"]  # how many those are; the rest repeats one of them
     radius: Float[Array, "K"]  # of a ball about the box centre
     sketch: Float[Array, "K P 3"]  # surface points, object frame
     sketch_normal: Float[Array, "K P 3"]
@@ -130,7 +130,7 @@ def library_arrays(library: Library) -> LibraryArrays:
         T_contact_object=stack(T_contact_object),
         face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
         hull_corner=stack([np.pad(h, ((0, MOST_CORNERS - len(h)), (0, 0)), "edge").T for h in hulls]),
-        hull_corners=stack([np.array(len(h)) for h in hulls], np.int32),
+        hull_count=stack([np.array(len(h)) for h in hulls], np.int32),
         radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
         sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
         sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),

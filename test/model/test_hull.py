@@ -92,7 +92,7 @@ def test_rays_meet_nothing_outside(shape):
     assert len(pixel) > 5000
     met = depth[pixel, pose, None] * np.stack([x[pixel], y[pixel], np.ones(len(pixel))], -1)
     met = np.einsum("nba,nb->na", T[pose, :3, :3], met - T[pose, :3, 3])
-    corners = np.asarray(library.hull_corner[0]).T[: int(library.hull_corners[0])]
+    corners = np.asarray(library.hull_corner[0]).T[: int(library.hull_count[0])]
     assert outside(met, corners) < 1e-5
     # Corners are met by some ray, give or take what planes go on beyond their cubes.
     assert ConvexHull(corners).volume < 1.4 * ConvexHull(met).volume

@@ -67,7 +67,7 @@ def _things(drawn: Drawn, library: LibraryArrays) -> tuple[Array, ...]:
         _real(library.voxel_size),
         _whole(drawn.type),
         _real(library.hull_corner),
-        _whole(library.hull_corners),
+        _whole(library.hull_count),
         _real(drawn.T_camera_object[..., :3, :]),
         _real(drawn.plane),
     )

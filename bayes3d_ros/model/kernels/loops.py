@@ -384,7 +384,7 @@ class Things(NamedTuple):
     size: Float[np.ndarray, "T"]
     kind: Int[np.ndarray, "N*K"]
     hull_corner: Float[np.ndarray, "T*3*C"]
-    hull_corners: Int[np.ndarray, "T"]
+    hull_count: Int[np.ndarray, "T"]
     pose: Float[np.ndarray, "N*K*12"]
 
 
@@ -911,7 +911,7 @@ def _outlines(things, n, objects, picture, space):
         box, space.behind[k] = _outline(
             things.pose[12 * thing : 12 * thing + 12],
             things.hull_corner[3 * corners * kind : 3 * corners * (kind + 1)],
-            _whole_vectors(things.hull_corners[kind]),
+            _whole_vectors(things.hull_count[kind]),
             picture,
             k,
             space,
@@ -1045,7 +1045,7 @@ def _objects(things, planes):
 @_whole
 def _most_corners(things):
     """How many corners of a hull there is room for."""
-    return len(things.hull_corner) // (3 * len(things.hull_corners))
+    return len(things.hull_corner) // (3 * len(things.hull_count))
 
 
 @_whole
