@@ -46,7 +46,7 @@ demo: setup
 LEARNED := mug mustard_bottle cracker_box
 demo-learn: setup
 	for name in $(LEARNED); do \
-	    $(BIN)/bayes3d learn bags/views_$$name --name $$name --library $(OUT)-learn/library || exit; \
+	    $(BIN)/bayes3d learn bags/views_$$name --name $$name --library $(OUT)-learn/library --replace || exit; \
 	done
 	$(BIN)/bayes3d parse bags/three_objects --library $(OUT)-learn/library --out $(OUT)-learn/parsed
 

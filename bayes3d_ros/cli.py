@@ -40,6 +40,10 @@ def _device_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
+def _replace_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option("--replace", is_flag=True, help="Replace a model of the same name; default: refuse.")(command)
+
+
 def _choose_device(device: str | None) -> None:
     """Before jax is imported. Does not take most of a GPU's memory from the other programs of a robot."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -146,14 +150,25 @@ def _frame_line(posterior: "ScenePosterior") -> str:
 @click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FILE)
 @click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
 @click.option("--voxel-size", type=click.FloatRange(0, min_open=True), default=0.003, show_default=True, help="Metres.")
-def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float) -> None:
-    """Make object models from meshes in metres; a model is named after its file."""
-    from bayes3d_ros.model.mesh_import import import_meshes
+@click.option(
+    "--scale",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Metres that a unit of the meshes is: 0.001 for millimetres.",
+)
+@_replace_option
+def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: float, replace: bool) -> None:
+    """Make object models from meshes in metres; a model is named after its file. All or none are written."""
+    from bayes3d_ros.model.mesh_import import make_models
+    from bayes3d_ros.model.objects import save_model
 
-    for done in _progress(import_meshes(meshes, library, voxel_size), len(meshes), "mesh"):
-        _say(f"{done.model}  {done.model.stat().st_size / 1000:.1f} kB")
-        if done.warning:
-            _say(f"{done.mesh}: {done.warning}", err=True)
+    models = make_models(meshes, library, voxel_size, scale=scale, replace=replace)
+    for made in list(_progress(models, len(meshes), "mesh")):
+        path = save_model(made.model, library, replace=replace)
+        click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB")
+        if made.warning:
+            click.echo(f"{made.mesh}: {made.warning}", err=True)
 
 
 @main.command()
@@ -165,8 +180,16 @@ def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float) -> None:
 @click.option("--views", type=click.IntRange(1, 10), default=10, show_default=True, help="Most views to use.")
 @click.option("--cluster", type=click.Choice(["only", "largest", "central"]), help="Which of several things to learn.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
+@_replace_option
 def learn(
-    bag: Path, name: str, library: Path, topic: str | None, views: int, more: tuple[str, ...], **options: Any
+    bag: Path,
+    name: str,
+    library: Path,
+    topic: str | None,
+    views: int,
+    more: tuple[str, ...],
+    replace: bool,
+    **options: Any,
 ) -> None:
     """Learn a model of an object from views of it: depth, CameraInfo and camera_pose of one stamp each."""
     from bayes3d_ros.bags import read_frames
@@ -174,9 +197,11 @@ def learn(
     from bayes3d_ros.inference.object_learning import check_name, spread_views
     from bayes3d_ros.inference.object_learning import learn as learn_model
     from bayes3d_ros.inference.settings import LearnerSettings
-    from bayes3d_ros.model.objects import save_model
+    from bayes3d_ros.model.objects import refuse_existing, save_model
 
     check_name(name)
+    if not replace:
+        refuse_existing(library, name)
     settings = _settings(LearnerSettings, more, options)
     reader = read_frames(bag, topic)
     poses = [frame.T_table_camera for frame in _progress(reader, len(reader), "frame")]
@@ -196,7 +221,7 @@ def learn(
     used = sum(not view.refused for view in learned.views)
     click.echo(f"{name}: {size} m, {len(model.surface_index)} surface voxels, {learned.coverage:.0%} of them seen")
     title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
-    click.echo(f"{save_model(model, library)}")
+    click.echo(f"{save_model(model, library, replace=replace)}")
     click.echo(f"{plot_model(model, library / f'{name}.png', title)}")
 
 

@@ -84,7 +84,7 @@ from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import save_model
 models = [model_from_mesh(trimesh.creation.box((0.1, 0.1, 0.1 + 0.02 * k)), "mug", 0.004) for k in range(2)]
 for k in range(10_000):
-    save_model(models[k % 2], Path(sys.argv[2]))
+    save_model(models[k % 2], Path(sys.argv[2]), replace=True)
     print(k, flush=True)
 """
 

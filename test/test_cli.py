@@ -153,7 +153,7 @@ def test_bad_files_are_named(bag, library, parsers, tmp_path):
     (library / "block.npz").write_bytes(b"no model")
     assert_one_line(run("parse", bag, "--library", library, *out), 2, library / "block.npz")
     (tmp_path / "file").write_text("")
-    save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01), library)
+    save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01), library, replace=True)
     bad_out = ("parse", bag, "--library", library, "--out")
     assert_one_line(run(*bad_out, tmp_path / "file"), 2, tmp_path / "file")
     assert_one_line(run(*bad_out, tmp_path / "file" / "sub"), 2, tmp_path / "file" / "sub")
@@ -247,6 +247,21 @@ def test_import_names_models_after_files(tmp_path):
     assert run("import", tmp_path / "brick.stl", "--library", library, "--voxel-size", "0").exit_code == 2
 
 
+def test_import_refuses_models_that_exist_and_meshes_in_millimetres(tmp_path):
+    box, library = tmp_path / "brick.stl", tmp_path / "library"
+    trimesh.creation.box((50, 40, 30)).export(box)
+    options = "--library", library, "--voxel-size", "0.01"
+    assert_one_line(run("import", box, *options), 2, box, "50 x 40 x 30 m", "--scale 0.001")
+    assert not library.exists()
+    assert run("import", box, *options, "--scale", "0.001").exit_code == 0
+    (model,) = load_library(library).models
+    assert sorted(model.box_size) == pytest.approx([0.03, 0.04, 0.05])
+    assert_one_line(run("import", box, *options, "--scale", "0.002"), 2, library / "brick.npz", "--replace")
+    assert run("import", box, *options, "--scale", "0.002", "--replace").exit_code == 0
+    assert max(load_library(library).models[0].box_size) == pytest.approx(0.1)
+    assert_one_line(run("import", box, *options, "--scale", "nan"), 2, "scale")
+
+
 def test_help_does_not_load_what_is_heavy():
     program = (
         "import sys; from bayes3d_ros import cli; print([m for m in ('jax', 'numpy', 'scipy') if m in sys.modules])"
@@ -271,6 +286,14 @@ def test_learn_writes_a_model_and_its_picture(tmp_path):
     (model,) = load_library(tmp_path / "library").models
     assert model.name == "mustard" and model.surface_views.max() == 2
     assert (tmp_path / "library" / "mustard.png").stat().st_size > 10_000
+    assert run("learn", bag, *options, "--replace").exit_code == 0
+
+
+def test_learn_refuses_a_name_that_exists_before_it_reads_anything(library, tmp_path):
+    before = (library / "block.npz").read_bytes()
+    result = run("learn", tmp_path / "no_bag", "--name", "block", "--library", library)
+    assert_one_line(result, 2, library / "block.npz", "exists already", "--replace")
+    assert (library / "block.npz").read_bytes() == before
 
 
 @pytest.mark.parametrize(

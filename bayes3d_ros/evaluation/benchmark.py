@@ -109,8 +109,7 @@ def rows() -> Iterator[SpeedRow]:
 
 def ycb_library(types: tuple[str, ...], folder: Path, voxel_size: float = DEFAULT_VOXEL_SIZE) -> Path:
     """A library of YCB objects. Raises MeshError where the meshes are not installed."""
-    for _ in import_meshes([ycb_mesh(name) for name in types], folder, voxel_size):
-        pass
+    import_meshes([ycb_mesh(name) for name in types], folder, voxel_size, replace=True)
     return folder
 
 

@@ -9,7 +9,9 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-MILLIMETRES_FROM = 3.0  # a tabletop object larger than this (m) was very likely stored in millimetres
+SMALLEST, LARGEST = 0.005, 2.0  # metres, along the longest side: beyond these a mesh is not in metres
+LARGE = 1.0  # metres: a tabletop object may be as long as this, but a small one in centimetres may seem to be
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "kilometres": 1000.0}  # of one, in metres
 
 
 class MeshError(ValueError):
@@ -69,11 +71,27 @@ def check_mesh(mesh: trimesh.Trimesh) -> None:
         raise MeshError(f"the mesh is flat or of zero size (extents {_metres(mesh.extents)})")
 
 
-def scale_warning(mesh: trimesh.Trimesh) -> str | None:
-    """One line where the mesh is so large that it was probably stored in millimetres, else None."""
-    if mesh.extents.max() <= MILLIMETRES_FROM:
+def size_problem(mesh: trimesh.Trimesh) -> str | None:
+    """One line where no tabletop object has this size, so that the mesh cannot be in metres; else None. It tells the
+    --scale of the units in which the mesh would be of a likely size."""
+    longest = float(mesh.extents.max())
+    if SMALLEST <= longest <= LARGEST:
         return None
-    return f"the mesh measures {_metres(mesh.extents)}; meshes are read in metres, is this one in millimetres?"
+    likely = [f"{s:g} if it is in {unit}" for unit, s in _UNITS.items() if 2 * SMALLEST <= s * longest <= LARGE]
+    remedy = (
+        f"meshes are read in metres; --scale {', '.join(likely)}" if likely else "--scale makes metres of its units"
+    )
+    expected = f"expected {SMALLEST} to {LARGEST:g} m along its longest side"
+    return f"the mesh measures {_metres(mesh.extents)}, {expected}: {remedy}"
+
+
+def size_warning(mesh: trimesh.Trimesh) -> str | None:
+    """One line where a tabletop object may have this size, but few do; else None."""
+    if mesh.extents.max() <= LARGE:
+        return None
+    return (
+        f"the mesh measures {_metres(mesh.extents)}, which is large for a tabletop object: is it in metres (--scale)?"
+    )
 
 
 def _metres(extents: Float[np.ndarray, "3"]) -> str:

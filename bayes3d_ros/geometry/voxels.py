@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, scale_warning
+from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem
 
 MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
 SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
@@ -43,7 +43,7 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     shape = np.ceil((high - low) / voxel_size + 0.5)
     if shape.prod() > MAX_VOXELS or mesh.area / voxel_size**2 > 1e6:
         size = " x ".join(f"{n:.0f}" for n in shape)
-        remedy = scale_warning(mesh) or "choose larger voxels"
+        remedy = size_problem(mesh) or "choose larger voxels"
         raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; {remedy}")
     shape = shape.astype(int)
     origin = (low + high) / 2 - shape * voxel_size / 2

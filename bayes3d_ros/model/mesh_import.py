@@ -8,13 +8,29 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from bayes3d_ros.geometry.mesh import MeshError, check_mesh, load_mesh, minimum_box, resting_facets, scale_warning
+from bayes3d_ros.geometry.mesh import (
+    MeshError,
+    check_mesh,
+    load_mesh,
+    minimum_box,
+    resting_facets,
+    size_problem,
+    size_warning,
+)
 from bayes3d_ros.geometry.voxels import voxelize
-from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel, save_model
+from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel, refuse_existing, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
 CLOSENESS = np.deg2rad(8.0)  # of two such facets, the likelihood of the one this much farther off counts e times less
+
+
+class MeshModel(NamedTuple):
+    """The model of one mesh file, not written yet."""
+
+    mesh: Path
+    model: ObjectModel
+    warning: str | None  # one line, or None
 
 
 class ImportedMesh(NamedTuple):
@@ -26,13 +42,37 @@ class ImportedMesh(NamedTuple):
 
 
 def import_meshes(
-    paths: Iterable[Path], folder: Path, voxel_size: float = DEFAULT_VOXEL_SIZE
-) -> Iterator[ImportedMesh]:
-    """Write a model for every mesh file into the library `folder`, yielding each as it is done.
+    paths: Iterable[Path],
+    folder: Path,
+    voxel_size: float = DEFAULT_VOXEL_SIZE,
+    *,
+    scale: float = 1.0,
+    replace: bool = False,
+) -> list[ImportedMesh]:
+    """Write a model for every mesh file into the library `folder`; see `make_models` for what is raised.
 
-    Raises MeshError with one line naming the file: before anything is written for names that cannot be used, later
-    for a mesh that cannot be; models already yielded stay, and the failing one leaves the library as it was.
+    All models are made before the first is written: a mesh that cannot be used leaves the library as it was.
     """
+    made = list(make_models(paths, folder, voxel_size, scale=scale, replace=replace))
+    return [ImportedMesh(m.mesh, save_model(m.model, folder, replace=replace), m.warning) for m in made]
+
+
+def make_models(
+    paths: Iterable[Path],
+    folder: Path,
+    voxel_size: float = DEFAULT_VOXEL_SIZE,
+    *,
+    scale: float = 1.0,
+    replace: bool = False,
+) -> Iterator[MeshModel]:
+    """The model of every mesh file, for a library `folder` to which nothing is written. `scale` is what one unit of the
+    meshes is in metres.
+
+    Raises, before any work, MeshError where a name cannot be used, and LibraryError where models of these names exist
+    and are not to be replaced; later MeshError for a mesh that cannot be used. Each is one line naming the files.
+    """
+    if not 0 < scale < np.inf:
+        raise MeshError(f"scale: expected a positive number of metres, got {scale}")
     paths = [Path(path) for path in paths]
     stems: dict[str, Path] = {}
     for path in paths:
@@ -43,16 +83,26 @@ def import_meshes(
         if not path.is_file():
             raise MeshError(f"{path}: no such mesh file")
         stems[path.stem] = path
+    if not replace:
+        refuse_existing(folder, *stems)
     for path in paths:
         mesh = load_mesh(path)
         try:
-            model = model_from_mesh(mesh, path.stem, voxel_size, source=path.name)
+            yield _made(path, mesh.apply_scale(scale), voxel_size)
         except MeshError as error:
-            raise MeshError(f"{path}: {error}") from error
-        warning = scale_warning(mesh)
-        if model.box_size.max() < 2 * voxel_size:
-            warning = f"the mesh is only {model.box_size.max():.2g} m long, less than two voxels of {voxel_size} m"
-        yield ImportedMesh(path, save_model(model, folder), warning)
+            given = "" if scale == 1 else f"at --scale {scale:g} "
+            raise MeshError(f"{path}: {given}{error}") from error
+
+
+def _made(path: Path, mesh: trimesh.Trimesh, voxel_size: float) -> MeshModel:
+    problem = size_problem(mesh)
+    if problem:
+        raise MeshError(problem)
+    model = model_from_mesh(mesh, path.stem, voxel_size, source=path.name)
+    warning = size_warning(mesh)
+    if model.box_size.max() < 2 * voxel_size:
+        warning = f"the mesh is only {model.box_size.max():.2g} m long, less than two voxels of {voxel_size} m"
+    return MeshModel(path, model, warning)
 
 
 def model_from_mesh(

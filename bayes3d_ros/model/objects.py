@@ -119,10 +119,24 @@ class Library:
         return tuple(m.name for m in self.models)
 
 
-def save_model(model: ObjectModel, folder: Path) -> Path:
-    """Write `folder/NAME.npz` (made where missing), whole or not at all; an older model of the name is replaced.
+def refuse_existing(folder: Path, *names: str) -> None:
+    """Raise LibraryError, one line with their files, where a library folder holds models of some of these names."""
+    paths = [_model_path(folder, name) for name in names]
+    found = [str(path) for path in paths if os.path.lexists(path)]
+    if found:
+        what = "a model of this name exists" if len(found) == 1 else "models of these names exist"
+        raise LibraryError(f"{', '.join(found)}: {what} already; --replace (of a node: replace:=true) replaces it")
 
-    Planes are quantised to 8 bits a number: directions to 0.3 degrees, offsets to 1/146 voxel.
+
+def _model_path(folder: Path, name: str) -> Path:
+    return Path(folder) / f"{name}.npz"
+
+
+def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Path:
+    """Write `folder/NAME.npz` (made where missing), whole or not at all.
+
+    Raises LibraryError where a model of the name exists, also if another process has just written it, unless it is to
+    be replaced. Planes are quantised to 8 bits a number: directions to 0.3 degrees, offsets to 1/146 voxel.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -155,17 +169,31 @@ def save_model(model: ObjectModel, folder: Path) -> Path:
     }
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
-    path = folder / f"{model.name}.npz"
+    path = _model_path(folder, model.name)
     handle, temporary = tempfile.mkstemp(prefix=f".{model.name}-", suffix=".tmp", dir=folder)
     try:
         with os.fdopen(handle, "wb") as file:
             np.savez_compressed(file, **arrays)
         os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
+        if replace:
+            os.replace(temporary, path)
+        else:
+            _move_to_new(temporary, path)
+    finally:
         Path(temporary).unlink(missing_ok=True)
-        raise
     return path
+
+
+def _move_to_new(temporary: str, path: Path) -> None:
+    """Give a file its name, unless that is taken: a rename would replace what another process has just written."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        refuse_existing(path.parent, path.stem)
+        raise
+    except OSError:  # a file system without hard links
+        refuse_existing(path.parent, path.stem)
+        os.replace(temporary, path)
 
 
 def _offset_step(voxel_size: float) -> float:

@@ -129,7 +129,7 @@ class ObjectLearnerNode(Node):
             raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
         self.get_logger().info(f"building {store.folder.name} from {len(frames)} view{'s' * (len(frames) != 1)}")
         learned = learn(frames[:MOST_VIEWS], store.folder.name, settings)
-        path = save_model(learned.model, self._library())
+        path = save_model(learned.model, self._library(), replace=True)
         self._publish(learned, frames[-1].stamp_ns)
         used = sum(not view.refused for view in learned.views)
         size = " x ".join(f"{v:.3f}" for v in learned.model.box_size)

