@@ -5,7 +5,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, cast
+from typing import NoReturn, Protocol, cast
 
 import rclpy
 from rclpy.context import Context
@@ -13,6 +13,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from bayes3d_ros.ros.transport import use_large_messages
+
+_PATIENCE = 0.3  # seconds that a frame may still take when a node is told to stop
 
 
 class StoppableNode(Protocol):
@@ -23,10 +25,14 @@ class StoppableNode(Protocol):
         ...
 
 
-def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
-    """Spin a node until SIGINT, SIGTERM or a shutdown of ROS; the exit status is 0 for all of them."""
+def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -> NoReturn:
+    """Spin a node until SIGINT, SIGTERM or a shutdown of ROS, then end the process; its exit status is 0 for all of
+    them.
+
+    The process ends as soon as the node is gone and its DDS participant has said goodbye. To take the interpreter and
+    JAX apart would take seconds more, and a compilation or a long frame on the worker's thread cannot be interrupted.
+    """
     node = None
-    stopped = True
     try:
         with until_stopped():
             use_large_messages()
@@ -35,15 +41,12 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
             rclpy.spin(cast(Node, node))
     finally:
         if node is not None:
-            stopped = node.stop(timeout=2.0)
+            node.stop(timeout=_PATIENCE)
             cast(Node, node).destroy_node()
         shut_down()
-    if not stopped:
-        # A compilation or a long frame cannot be interrupted, and the interpreter must not be torn down under it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(0)
-    return 0
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 @contextmanager
