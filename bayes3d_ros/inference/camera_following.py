@@ -24,13 +24,12 @@ class CameraFollower:
         self._told = None if world is None else tracker.start(world, np.eye(4))
 
     def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
-        """One frame, the first one where nothing is known yet. Raises TrackingError or ParseError, and then what was
+        """One frame, the first one where nothing is known yet. Where stamps jump, back (a bag that loops, a clock that
+        was set back) or far ahead, the camera is found again. Raises TrackingError or ParseError, and then what was
         known still is."""
         if known is None:
             return self._first(frame)
-        longest = self.tracker.settings.longest_gap
-        late = known.stamp_ns is not None and 1e-9 * (frame.stamp_ns - known.stamp_ns) > longest
-        if not late:
+        if self._follows(known, frame):
             now, estimate = self.tracker.step(known, frame)
             if not estimate.lost:
                 return now, estimate
@@ -43,6 +42,12 @@ class CameraFollower:
         if estimate.lost and self._told is not None:
             return self._looked_for(known, frame)
         return now, replace(estimate, found_again=True)
+
+    def _follows(self, known: Tracking, frame: DepthFrame) -> bool:
+        """Whether the frame is so soon after the last one that the camera's motion tells where it is."""
+        if known.stamp_ns is None:
+            return True
+        return 0 < 1e-9 * (frame.stamp_ns - known.stamp_ns) <= self.tracker.settings.longest_gap
 
     def _first(self, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         if self._told is None:

@@ -118,12 +118,16 @@ def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
     assert np.abs(off(estimate, poses[9])[:3]).max() < 0.006
 
 
-def test_after_a_long_gap_the_camera_is_looked_for(tracker, world, frame):
+@pytest.mark.parametrize("gap", [2.0, 0.0, -0.1, -60.0])
+def test_after_a_jump_of_stamps_the_camera_is_looked_for(tracker, world, frame, gap):
+    """Ahead by more than longest_gap, or back by anything: a bag that loops, a clock that is set back."""
     there = looking(-0.8)
     follower = CameraFollower(tracker, SimpleNamespace(parse=lambda seen: parsed(world, there, seen)))
-    known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9 - 2 * 10**9)
+    known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9 - round(gap * 10**9))
     known, estimate = follower.step(known, frame(0, there))
     assert estimate.found_again and not estimate.lost
+    known, estimate = follower.step(known, frame(1, there))
+    assert not estimate.found_again and not estimate.lost
 
 
 @pytest.mark.parametrize("azimuth", [0.4, 2.5, 4.4])
