@@ -63,6 +63,11 @@ class SceneParser:
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._smooth_error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._cast = jax.jit(renderers["march"])
+        self._sizes: set[tuple[int, int]] = set()  # of images that have been parsed
+
+    def compiled_for(self, width: int, height: int) -> bool:
+        """Whether an image of this size (pixels) can be parsed without compiling first."""
+        return (width, height) in self._sizes
 
     def warm_up(self, width: int, height: int) -> None:
         """Compile for images of this size (values of the intrinsics do not matter) by parsing a made-up frame: a bare
@@ -77,6 +82,7 @@ class SceneParser:
             image, table, *_ = self._observe(frame)
             context, grid = self._context(image, table)
             self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
+        self._sizes.add((width, height))
         rays = jnp.zeros((height, width))
         self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
 
@@ -87,6 +93,7 @@ class SceneParser:
         image, table, T_camera_table, notes = self._observe(frame)
         context, grid = self._context(image, table)
         stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, grid)
+        self._sizes.add((frame.intrinsics.width, frame.intrinsics.height))
         samples, log_evidence = self._mix(stages, table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
         reconstruction, segmentation = self._reconstruct(frame, T_camera_table, samples, summary)

@@ -121,14 +121,22 @@ class Library:
 
 def refuse_existing(folder: Path, *names: str) -> None:
     """Raise LibraryError, one line with their files, where a library folder holds models of some of these names."""
-    paths = [_model_path(folder, name) for name in names]
+    paths = [model_path(folder, name) for name in names]
     found = [str(path) for path in paths if os.path.lexists(path)]
     if found:
         what = "a model of this name exists" if len(found) == 1 else "models of these names exist"
         raise LibraryError(f"{', '.join(found)}: {what} already; --replace (of a node: replace:=true) replaces it")
 
 
-def _model_path(folder: Path, name: str) -> Path:
+def learned_from(model: ObjectModel) -> set[int]:
+    """Stamps (nanoseconds) of the views that a model was learned from; empty for one of a mesh."""
+    if model.provenance.get("kind") != "views":
+        return set()
+    return {view["stamp_ns"] for view in model.provenance["views"]}
+
+
+def model_path(folder: Path, name: str) -> Path:
+    """The file of a model in a library folder."""
     return Path(folder) / f"{name}.npz"
 
 
@@ -169,7 +177,7 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
     }
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
-    path = _model_path(folder, model.name)
+    path = model_path(folder, model.name)
     handle, temporary = tempfile.mkstemp(prefix=f".{model.name}-", suffix=".tmp", dir=folder)
     try:
         with os.fdopen(handle, "wb") as file:

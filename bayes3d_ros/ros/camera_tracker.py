@@ -32,14 +32,19 @@ from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.model.world_file import load_world
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, one_line, why_no_input
-from bayes3d_ros.ros.parameters import CAMERA_TRACKER_SETTINGS, CameraTrackerNodeSettings, SettingsParameters
+from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, Health, InputView, judge, one_line
+from bayes3d_ros.ros.parameters import (
+    CAMERA_TRACKER_SETTINGS,
+    CameraTrackerNodeSettings,
+    DepthInputSettings,
+    SettingsParameters,
+)
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
 
 _RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 _TRACKER_PARAMETERS = ("library", "world", *(f.name for f in fields(TrackerSettings)))
-_INPUT_PARAMETERS = ("qos_reliability", "table_frame", "camera_pose", "patience")
+_INPUT_PARAMETERS = tuple(f.name for f in fields(DepthInputSettings))
 
 
 class Follower(Protocol):
@@ -71,7 +76,8 @@ class CameraTrackerNode(Node):
         self._settings = SettingsParameters(self, CAMERA_TRACKER_SETTINGS)
         self._session: _Session | None = None
         self._known: Tracking | None = None  # the worker's own
-        self._refusal, self._told, self._since = "", "", time.monotonic()
+        self._refusal, self._told = "", ""
+        self._received_before, self._dropped_before = 0, 0
         self._path: deque[PoseStamped] = deque(maxlen=self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", _RELIABLE)
         self._particles = self.create_publisher(PoseArray, "~/particles", _RELIABLE)
@@ -84,7 +90,7 @@ class CameraTrackerNode(Node):
         self.add_post_set_parameters_callback(self._after_set_parameters)
         self._open_inputs()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.05, self._tick, clock=steady)
+        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         self._begin()
 
@@ -113,15 +119,22 @@ class CameraTrackerNode(Node):
             self._refusal = str(error)
             self.get_logger().error(f"{error}; correct it, then call ~/reset")
             return str(error)
-        self._refusal, self._since = "", time.monotonic()
-        self._told = "the next frame shows the world"
+        self._refusal, self._told = "", "the next frame shows the world"
         if world is not None:
             self._told = f"the world is {len(world.types)} known object{'s' * (len(world.types) != 1)}"
 
         def job() -> None:
             self._known, self._session = None, None
             self._path.clear()
-            self._session = _Session(self._make(library, settings, world), jax.default_backend())
+            self._health.begin()
+            try:
+                with self._health.doing("loading the library"):
+                    self._session = _Session(self._make(library, settings, world), jax.default_backend())
+            except Exception as error:
+                self._refusal = f"cannot make the tracker: {one_line(error)}"
+                self.get_logger().error(self._refusal)
+                self.get_logger().debug(traceback.format_exc())
+                return
             self.get_logger().info(f"{self._told}; inference on {self._session.backend}")
 
         self._worker.call(job)
@@ -140,10 +153,12 @@ class CameraTrackerNode(Node):
         """On the worker's thread: one frame from messages to messages."""
         session = self._session
         if session is None:
+            self._health.discard()
             return
         try:
-            frame = frame_from_messages(messages.image, messages.info, messages.T_table_camera)
-            known, estimate = session.follower.step(self._known, frame)
+            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
+            with self._working():
+                known, estimate = session.follower.step(self._known, frame)
         except (ValueError, TrackingError, ParseError) as error:
             self._problem(f"lost: {error}" if self._known is not None else str(error))
             return
@@ -160,6 +175,12 @@ class CameraTrackerNode(Node):
             self._trail.publish(PathMessage(header=self._path[-1].header, poses=list(self._path)))
         self._health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
 
+    def _working(self) -> contextlib.AbstractContextManager[None]:
+        """What the node does meanwhile, for diagnostics."""
+        if self._known is None:
+            return self._health.doing("compiling (a minute or two the first time) and looking at the first frame")
+        return self._health.doing("tracking one frame", usual=QUIET)
+
     def _worker_failed(self, error: Exception) -> None:
         self._problem(f"internal error, please report it: {one_line(error)}")
         self.get_logger().debug("".join(traceback.format_exception(error)))
@@ -171,16 +192,7 @@ class CameraTrackerNode(Node):
     # Inputs and parameters
 
     def _open_inputs(self) -> None:
-        settings = self._node_settings()
-        self._inputs = DepthInputs(
-            self,
-            self._worker.submit,
-            reliability=settings.qos_reliability,
-            table_frame=settings.table_frame,
-            fixed_pose=settings.camera_pose,
-            use_pose=True,
-            patience=settings.patience,
-        )
+        self._inputs = DepthInputs(self, self._worker.submit, self._node_settings())
 
     def _tick(self) -> None:
         if self._inputs is not None:
@@ -193,6 +205,8 @@ class CameraTrackerNode(Node):
         names = {p.name for p in parameters}
         if self._inputs is not None and names & set(_INPUT_PARAMETERS):
             self._inputs.close()
+            self._received_before += self._inputs.received
+            self._dropped_before += self._inputs.dropped
             self._open_inputs()
         if "path_length" in names:
             self._path = deque(self._path, self._node_settings().path_length)
@@ -203,7 +217,8 @@ class CameraTrackerNode(Node):
 
     def _report(self) -> None:
         assert self._inputs is not None
-        level, message = self._why(self._inputs)
+        view = self._inputs.view()
+        level, message = self._why(view)
         session = self._session
         self._health.backend = session.backend if session else ""
         report = self._health.report(
@@ -211,22 +226,17 @@ class CameraTrackerNode(Node):
             level,
             message,
             state="tracking" if level == OK else "waiting" if self._known is None else "lost",
-            received=self._inputs.received,
-            dropped=self._worker.dropped + self._inputs.dropped,
-            notes=self._inputs.notes(),
+            received=self._received_before + self._inputs.received,
+            dropped=self._dropped_before + self._worker.dropped + self._inputs.dropped,
+            view=view,
         )
         self._diagnostics.publish(report)
 
-    def _why(self, inputs: DepthInputs) -> tuple[bytes, str]:
+    def _why(self, view: InputView) -> tuple[bytes, str]:
         """The level and the one line that says whether there is output, and if not, why."""
         if self._refusal:
             return ERROR, self._refusal
-        why = self._health.recent_problem()
-        if self._worker.idle:
-            why = why_no_input(inputs.view()) or why
-        elif self._known is None and not why:
-            why = f"compiling and looking at the first frame, {time.monotonic() - self._since:.0f} s so far"
-        return (WARN, why) if why else (OK, "tracking")
+        return judge(self._health, view, idle=self._worker.idle, good="tracking")
 
 
 def main(args: list[str] | None = None) -> int:

@@ -2,21 +2,19 @@
 
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 
+from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose, CameraPoseSource
 from bayes3d_ros.ros.conversions import stamp_to_ns
-from bayes3d_ros.ros.diagnostics import Inputs
-from bayes3d_ros.ros.frames import CameraPoses
-from bayes3d_ros.ros.pairing import Pair, StampPairing
+from bayes3d_ros.ros.diagnostics import InputView, TopicView
+from bayes3d_ros.ros.input_queue import InputQueue
+from bayes3d_ros.ros.parameters import DepthInputSettings
+from bayes3d_ros.ros.subscriptions import AutoSubscription
 
 DEPTH_TOPIC, INFO_TOPIC = "depth/image_rect", "depth/camera_info"
 
@@ -26,135 +24,125 @@ class DepthMessages(NamedTuple):
 
     image: Image
     info: CameraInfo
-    T_table_camera: Float[np.ndarray, "4 4"] | None
+    pose: CameraPose
     arrived: float
+
+    @property
+    def T_table_camera(self) -> Float[np.ndarray, "4 4"] | None:
+        """The camera's pose in the table's frame, if there is one."""
+        return self.pose.T_table_camera
 
 
 class DepthInputs:
-    """Calls `deliver` for images as they become complete; the newest one wins.
+    """Calls `deliver` for images as they become complete; see input_queue.py and camera_pose_source.py.
 
-    `reliability`: reliable, best_effort, or auto, which starts reliable (best effort loses most images between
-    processes on Fast DDS's defaults) and changes over when a best-effort publisher turns up, which a reliable
-    subscription would never hear.
+    `use_pose`: no, yes, or required: then an image waits for a pose even if nobody seems to send one.
     """
 
     def __init__(
-        self,
-        node: Node,
-        deliver: Callable[[DepthMessages], None],
-        *,
-        reliability: str,
-        table_frame: str,
-        fixed_pose: tuple[float, ...],
-        use_pose: bool,
-        patience: float,
+        self, node: Node, deliver: Callable[[DepthMessages], None], settings: DepthInputSettings, use_pose: str = "yes"
     ) -> None:
-        self._node, self._deliver, self._patience = node, deliver, patience
-        self._pairing: StampPairing[Image, CameraInfo] = StampPairing(patience)
-        self._waiting: DepthMessages | None = None  # for the camera's pose
-        self._overtaken = 0
-        self.received = 0
+        self._deliver = deliver
+        self._queue: InputQueue[Image, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
+        self.received, self.delivered = 0, 0
+        self._delivered_at: float | None = None
         self._depth_at: float | None = None
         self._info_at: float | None = None
-        self._auto = reliability == "auto"
-        self._change_over = False
-        self._best_effort = reliability == "best_effort"
-        self._qos_problem = ""
-        self._poses = CameraPoses(node, table_frame, fixed_pose, QoSProfile(depth=64)) if use_pose else None
-        self._subscriptions: list[Subscription] = []
-        self._subscribe()
+        self._pose_used = NO_POSE
+        reliability = settings.qos_reliability
+        self._poses: CameraPoseSource | None = None
+        if use_pose != "no":
+            self._poses = CameraPoseSource(
+                node,
+                table_frame=settings.table_frame,
+                fixed_pose=settings.camera_pose,
+                reliability=reliability,
+                patience=settings.patience,
+                max_gap=settings.pose_max_gap,
+                tolerance=settings.pose_tolerance,
+                required=use_pose == "required",
+                on_pose=self._take,
+            )
+        self._image_topic = AutoSubscription(
+            node, Image, DEPTH_TOPIC, self._on_image, reliability=reliability, depth=10
+        )
+        self._info_topic = AutoSubscription(
+            node, CameraInfo, INFO_TOPIC, self._on_info, reliability=reliability, depth=10, latched=True
+        )
 
     @property
     def dropped(self) -> int:
         """Images that a newer one overtook."""
-        return self._pairing.dropped + self._overtaken
+        return self._queue.dropped
 
-    def view(self) -> Inputs:
+    @property
+    def waiting(self) -> int:
+        """Images that wait for what belongs to them."""
+        return self._queue.waiting
+
+    def view(self) -> InputView:
         """What is known of the inputs, for diagnostics."""
         now = time.monotonic()
-        ages = [None if at is None else now - at for at in (self._depth_at, self._info_at)]
-        topics = [self._node.resolve_topic_name(t) for t in (DEPTH_TOPIC, INFO_TOPIC)]
-        publishers = [self._node.count_publishers(t) for t in (DEPTH_TOPIC, INFO_TOPIC)]
-        return Inputs(topics[0], topics[1], publishers[0], publishers[1], ages[0], ages[1], self._qos_problem)
 
-    def notes(self) -> str:
-        """What a user should know though it does not stop the output."""
-        notes = []
-        if not self._pairing.stamps_agree:
-            notes.append("CameraInfo has other stamps than the images; the latest is used")
-        if self._poses is not None and self._poses.problem:
-            notes.append(self._poses.problem)
-        return "; ".join(notes)
+        def topic(subscription: AutoSubscription, heard: float | None) -> TopicView:
+            subscription.look()
+            age = None if heard is None else now - heard
+            return TopicView(subscription.topic, subscription.publishers, age, subscription.problem)
+
+        return InputView(
+            image=topic(self._image_topic, self._depth_at),
+            info=topic(self._info_topic, self._info_at),
+            waiting=self.waiting,
+            delivered_age=None if self._delivered_at is None else now - self._delivered_at,
+            pose_source=self._pose_used.source,
+            pose_problem=self._pose_problem(),
+            pose_topic="" if self._poses is None else self._poses.topic,
+            pose_publishers=() if self._poses is None else self._poses.publishers,
+            stamps_agree=self._queue.stamps_agree,
+        )
 
     def tick(self) -> None:
-        """To be called some 20 times a second: what has waited too long goes on without."""
-        if self._change_over:
-            self._change_over, self._best_effort = False, True
-            self._close_subscriptions()
-            self._subscribe()
-            self._node.get_logger().info("a publisher of depth is best effort: subscribing best effort")
-        self._take(self._pairing.expire(time.monotonic()))
-        self._resolve_pose()
+        """To be called some 50 times a second: what has waited too long goes on without."""
+        for subscription in (self._image_topic, self._info_topic):
+            subscription.tick()
+        if self._poses is not None:
+            self._poses.tick()
+        self._take()
 
     def close(self) -> None:
-        """Stop listening."""
-        self._close_subscriptions()
+        """Stop listening; what waits is dropped."""
+        self._image_topic.close()
+        self._info_topic.close()
         if self._poses is not None:
-            self._poses.close(self._node)
+            self._poses.close()
+        self._queue.clear()
 
-    def _subscribe(self) -> None:
-        reliability = ReliabilityPolicy.BEST_EFFORT if self._best_effort else ReliabilityPolicy.RELIABLE
-        qos = QoSProfile(depth=10, reliability=reliability)
-        for kind, topic, callback in ((Image, DEPTH_TOPIC, self._on_image), (CameraInfo, INFO_TOPIC, self._on_info)):
-            events = SubscriptionEventCallbacks(incompatible_qos=partial(self._on_incompatible, topic))
-            self._subscriptions.append(
-                self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events)
-            )
-
-    def _close_subscriptions(self) -> None:
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = []
-
-    def _on_incompatible(self, topic: str, event: QoSRequestedIncompatibleQoSInfo) -> None:
-        reliability = event.last_policy_kind == QoSPolicyKind.RELIABILITY
-        if self._auto and reliability and not self._best_effort:
-            self._change_over = True
-            return
-        policy = str(QoSPolicyKind(event.last_policy_kind).name).lower()
-        remedy = "; set qos_reliability to best_effort or auto" if reliability else ""
-        name = self._node.resolve_topic_name(topic)
-        self._qos_problem = f"incompatible QoS on {name}: the publisher's {policy} does not match{remedy}"
-        self._node.get_logger().warning(self._qos_problem)
-
-    def _on_image(self, image: Image) -> None:
+    def _on_image(self, image: Image, latched: bool) -> None:
         self._depth_at = time.monotonic()
         self.received += 1
-        self._take(self._pairing.add_image(stamp_to_ns(image.header.stamp), image, self._depth_at))
+        stamp_ns = stamp_to_ns(image.header.stamp)
+        if self._queue.add_image(stamp_ns, image, len(image.data), self._depth_at) and self._poses is not None:
+            self._poses.images_jumped()
+        self._take()
 
-    def _on_info(self, info: CameraInfo) -> None:
+    def _on_info(self, info: CameraInfo, latched: bool) -> None:
         self._info_at = time.monotonic()
-        self._take(self._pairing.add_info(stamp_to_ns(info.header.stamp), info))
+        self._queue.add_info(stamp_to_ns(info.header.stamp), info, self._info_at)
+        self._take()
 
-    def _take(self, pair: Pair[Image, CameraInfo] | None) -> None:
-        if pair is not None:
-            self._overtaken += self._waiting is not None
-            self._waiting = DepthMessages(pair.image, pair.info, None, time.monotonic())
-            self._resolve_pose()
+    def _find_pose(self, stamp_ns: int, image: Image, last: bool) -> CameraPose | None:
+        return NO_POSE if self._poses is None else self._poses.find(stamp_ns, image.header.frame_id, last)
 
-    def _resolve_pose(self) -> None:
-        """Deliver the image that waits once its camera pose is known, or when none is to be expected any more."""
-        work = self._waiting
-        if work is None:
-            return
-        pose = None
-        if self._poses is not None:
-            header = work.image.header
-            pose = self._poses.lookup(stamp_to_ns(header.stamp), header.frame_id)
-            if pose is None:
-                waited = time.monotonic() - work.arrived
-                if waited < self._patience and self._poses.awaited(header.frame_id):
-                    return
-                pose = self._poses.fallback()
-        self._waiting = None
-        self._deliver(work._replace(T_table_camera=pose))
+    def _pose_problem(self) -> str:
+        if self._poses is None:
+            return ""
+        return self._pose_used.problem or self._poses.refused
+
+    def _take(self) -> None:
+        """Deliver the newest complete image, if there is one."""
+        complete = self._queue.take(time.monotonic())
+        if complete is not None:
+            self._pose_used = complete.pose
+            self._delivered_at = time.monotonic()
+            self.delivered += 1
+            self._deliver(DepthMessages(complete.image, complete.info, complete.pose, complete.arrived))

@@ -1,9 +1,12 @@
 """What a node tells of itself once a second: how fast it is, and why there is no output when there is none."""
 
+import math
+import re
 import threading
 import time
-from collections import deque
-from collections.abc import Sequence
+from collections import OrderedDict, deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -12,41 +15,82 @@ from rclpy.clock import Clock
 from bayes3d_ros.ros.summary import key_values
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
-QUIET = 3.0  # seconds without a message after which an input is called silent
-REPEAT = 10.0  # seconds after which an unchanged problem is logged again
+QUIET = 3.0  # seconds without a message, or without an output, after which that is told
+REPEAT = 10.0  # seconds after which a line of the same kind is logged again
+_KINDS = 100  # kinds of lines that are remembered
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """What a node can see of its inputs: resolved topics, publishers, seconds since the last message (None: never)."""
+class TopicView:
+    """What a node can see of an input: its resolved name, the nodes that publish it (one entry a publisher), seconds
+    since the last message (None: never), and why a publisher cannot be heard."""
 
-    depth_topic: str
-    info_topic: str
-    depth_publishers: int
-    info_publishers: int
-    depth_age: float | None
-    info_age: float | None
+    name: str
+    publishers: tuple[str, ...] = ()
+    age: float | None = None
     qos_problem: str = ""
 
+    @property
+    def live(self) -> bool:
+        """Whether messages come in."""
+        return self.age is not None and self.age < QUIET
 
-def why_no_input(inputs: Inputs) -> str:
+
+@dataclass(frozen=True)
+class InputView:
+    """What a node can see of its inputs. `waiting` images are incomplete; `delivered_age` is seconds since the last
+    complete one (None: never)."""
+
+    image: TopicView
+    info: TopicView
+    waiting: int = 0
+    delivered_age: float | None = None
+    pose_source: str = "none"
+    pose_problem: str = ""
+    pose_topic: str = ""
+    pose_publishers: tuple[str, ...] = ()
+    stamps_agree: bool = True
+
+    @property
+    def delivering(self) -> bool:
+        """Whether images become complete."""
+        return self.delivered_age is not None and self.delivered_age < QUIET
+
+
+def why_no_input(view: InputView) -> str:
     """Why no image with its CameraInfo arrives, in one line; empty where both do."""
-    for topic, publishers, age in (
-        (inputs.depth_topic, inputs.depth_publishers, inputs.depth_age),
-        (inputs.info_topic, inputs.info_publishers, inputs.info_age),
-    ):
-        if age is not None and age < QUIET:
+    for topic in (view.image, view.info):
+        if topic.live:
             continue
-        if publishers == 0:
-            return f"no publisher on {topic}" + ("" if age is None else " any more") + "; start it, or remap the topic"
-        if inputs.qos_problem:
-            return inputs.qos_problem
-        if age is None:
-            return f"no message yet on {topic} ({publishers} publisher{'s' * (publishers > 1)})"
-        if topic == inputs.depth_topic:
-            return f"no message on {topic} for {age:.0f} s"
+        if not topic.publishers:
+            past = "" if topic.age is None else " any more"
+            return f"no publisher on {topic.name}{past}; start it, or remap the topic"
+        if topic.qos_problem:
+            return topic.qos_problem
+        if topic.age is None:
+            count = len(topic.publishers)
+            return f"no message yet on {topic.name} ({count} publisher{'s' * (count > 1)})"
+        if topic is view.image:
+            return f"no message on {topic.name} for {topic.age:.0f} s"
         # CameraInfo may well be sent only once: the last one goes on to serve.
     return ""
+
+
+def warnings(view: InputView) -> list[str]:
+    """What is wrong with the inputs though images are complete."""
+    told = []
+    if view.pose_problem:
+        told.append(f"no camera pose: {view.pose_problem}")
+    topics = ((view.image.name, view.image.publishers), (view.info.name, view.info.publishers))
+    for name, publishers in (*topics, (view.pose_topic, view.pose_publishers)):
+        if len(publishers) > 1:
+            told.append(f"{len(publishers)} publishers on {name}, expected one: {', '.join(sorted(publishers))}")
+    return told
+
+
+def notes(view: InputView) -> list[str]:
+    """What a user should know though nothing is wrong."""
+    return [] if view.stamps_agree else ["CameraInfo has other stamps than the images; the latest is used"]
 
 
 def one_line(error: Exception) -> str:
@@ -54,69 +98,160 @@ def one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
+class LogThrottle:
+    """Lets a line through if none of its kind came within REPEAT seconds. Lines of a kind differ in numbers and in what
+    is quoted; so numbers that change with every frame do not flood a log."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[str, float] = OrderedDict()
+
+    def lets(self, text: str) -> bool:
+        """Whether a line is to be logged now."""
+        kind, now = re.sub(r"'[^']*'|\"[^\"]*\"|[-+]?\d[\w.+-]*", "#", text), time.monotonic()
+        if now - self._last.get(kind, -math.inf) < REPEAT:
+            return False
+        self._last.pop(kind, None)
+        self._last[kind] = now
+        if len(self._last) > _KINDS:
+            self._last.popitem(last=False)
+        return True
+
+
 class Health:
     """Counts, times and the last problem of a node; used by its executor and its worker thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._throttle = LogThrottle()
         self._outputs: deque[float] = deque(maxlen=32)
-        self._problem, self._problem_at, self._logged_at = "", 0.0, -1e9
-        self._latency, self._seconds, self._ess = 0.0, "", ""
-        self.parsed, self.refused = 0, 0
+        self._began = time.monotonic()
+        self._problem, self._problem_at = "", -math.inf
+        self._doing: tuple[str, float, float] | None = None
+        self._latency, self._seconds, self._ess = 0.0, 0.0, ""
+        self._notes: tuple[str, ...] = ()
+        self.parsed, self.refused, self.discarded = 0, 0, 0
+        self.usable_share = math.nan
         self.backend = ""
 
-    def problem(self, text: str) -> bool:
-        """Note a frame that gave no output and why; True if that is worth a line in the log."""
+    def begin(self) -> None:
+        """From now on outputs are expected."""
+        with self._lock:
+            self._outputs.clear()
+            self._began = time.monotonic()
+            self._problem, self._problem_at, self._notes = "", -math.inf, ()
+
+    def problem(self, text: str, kind: str = "") -> bool:
+        """Note a frame that gave no output and why; True if that is worth a line in the log, where one line of a `kind`
+        (default: the text) is enough."""
         with self._lock:
             self.refused += 1
-            now, known = time.monotonic(), text == self._problem
-            self._problem, self._problem_at = text, now
-            if known and now - self._logged_at < REPEAT:
-                return False
-            self._logged_at = now
-            return True
+            self._problem, self._problem_at = text, time.monotonic()
+            return self._throttle.lets(kind or text)
 
-    def output(self, seconds: float, ess: Sequence[float], latency: float) -> None:
-        """Note an output: the seconds that inference took, effective shares of the particles, and how many seconds
-        after its image it came."""
+    def discard(self) -> None:
+        """Note a frame that came too late to be worked on: the node is inactive, or being set up anew."""
+        with self._lock:
+            self.discarded += 1
+
+    def output(self, seconds: float, ess: Sequence[float], latency: float, notes: Sequence[str] = ()) -> None:
+        """Note an output: the seconds that inference took, effective shares of the particles, how many seconds after
+        its image it came, and what a user should be warned of."""
         with self._lock:
             self.parsed += 1
             self._outputs.append(time.monotonic())
-            self._latency, self._seconds = latency, f"{seconds:.3f}"
+            self._latency, self._seconds, self._notes = latency, seconds, tuple(notes)
             self._ess = " ".join(f"{share:.2f}" for share in ess)
 
-    def recent_problem(self) -> str:
-        """The last problem, if no output has come since."""
+    @contextmanager
+    def doing(self, what: str, usual: float = 0.0) -> Iterator[None]:
+        """While this lasts, and after the `usual` seconds, it is why there is no output."""
         with self._lock:
-            answered = bool(self._outputs) and self._outputs[-1] > self._problem_at
-            return "" if answered else self._problem
+            self._doing = what, time.monotonic(), usual
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._doing = None
+
+    def why_silent(self, view: InputView) -> str:
+        """Why images come in and nothing goes out, in one line; empty where outputs come."""
+        with self._lock:
+            now = time.monotonic()
+            if self._doing is not None:
+                what, since, usual = self._doing
+                if now - since >= usual:
+                    return f"{what}, {now - since:.0f} s so far"
+            newest = self._outputs[-1] if self._outputs else None
+            if self._problem and (newest is None or newest < self._problem_at):
+                return self._problem
+            if newest is not None and now - newest < max(QUIET, 3 * self._seconds):
+                return ""
+            since, when = (self._began, "yet") if newest is None else (newest, "any more")
+            return f"no output {when}, for {now - since:.0f} s: {where_images_are(view)}"
+
+    def warnings(self) -> list[str]:
+        """What a user should be warned of in the last output."""
+        with self._lock:
+            return list(self._notes)
 
     def report(
-        self, name: str, level: bytes, message: str, *, state: str, received: int, dropped: int, notes: str
+        self, name: str, level: bytes, message: str, *, state: str, received: int, dropped: int, view: InputView | None
     ) -> DiagnosticArray:
-        """The message for /diagnostics, stamped with the system's time."""
+        """The message for /diagnostics, stamped with the system's time. `dropped` does not hold what was discarded."""
         with self._lock:
+            dropped += self.discarded
             status = DiagnosticStatus(name=name, level=level, message=message, hardware_id=self.backend or "none")
             status.values = key_values(
                 state=state,
                 rate_hz=f"{self._rate():.2f}",
                 latency_s=f"{self._latency:.3f}",
-                parse_s=self._seconds,
+                parse_s=f"{self._seconds:.3f}" if self.parsed else "",
                 received=str(received),
                 parsed=str(self.parsed),
                 refused=str(self.refused),
                 dropped=str(dropped),
+                waiting=str(received - self.parsed - self.refused - dropped),
+                camera_pose="" if view is None else view.pose_source,
+                usable_share="" if math.isnan(self.usable_share) else f"{self.usable_share:.2f}",
                 backend=self.backend,
                 ess=self._ess,
                 last_problem=self._problem,
-                notes=notes,
+                notes="" if view is None else "; ".join([*warnings(view), *notes(view), *self._notes]),
             )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = Clock().now().to_msg()
-        return array
+        return diagnostic_array(status)
 
     def _rate(self) -> float:
         """Outputs a second over the last ten seconds."""
         now = time.monotonic()
         recent = [t for t in self._outputs if now - t < 10.0]
         return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else len(recent) / 10.0
+
+
+def judge(health: Health, view: InputView, *, idle: bool, good: str) -> tuple[bytes, str]:
+    """The level and the one line that says whether there is output, and if not, why. `idle`: no frame is being worked
+    on; `good`: what the node does when all is well."""
+    missing = why_no_input(view) if idle else ""
+    if missing:
+        return WARN, missing
+    silent = health.why_silent(view)
+    if silent:
+        return WARN, silent
+    told = [*warnings(view), *health.warnings()]
+    return (WARN, f"{good}; {'; '.join(told)}") if told else (OK, good)
+
+
+def diagnostic_array(status: DiagnosticStatus) -> DiagnosticArray:
+    """A message for /diagnostics, stamped with the system's time."""
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = Clock().now().to_msg()
+    return array
+
+
+def where_images_are(view: InputView) -> str:
+    """Where images that come in are, if nothing comes out."""
+    if not view.waiting:
+        return "the last image is being worked on" if view.delivering else "no image is complete"
+    images = f"{view.waiting} image{'s wait' if view.waiting > 1 else ' waits'} for"
+    if view.info.age is None:
+        return f"{images} CameraInfo on {view.info.name}"
+    return f"{images} CameraInfo of their stamp on {view.info.name}, or the camera's pose ({view.pose_topic}, tf)"

@@ -4,6 +4,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +23,39 @@ from bayes3d_ros.inference.object_learning import (
     MOST_VIEWS,
     Learned,
     LearningError,
-    check_name,
     choose_thing,
     learn,
     new_share,
 )
 from bayes3d_ros.inference.settings import LearnerSettings
 from bayes3d_ros.inference.view_segmentation import Thing, ViewError, segment
-from bayes3d_ros.model.objects import save_model
+from bayes3d_ros.model.objects import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, why_no_input
-from bayes3d_ros.ros.parameters import OBJECT_LEARNER_SETTINGS, ObjectLearnerNodeSettings, Settings, SettingsParameters
+from bayes3d_ros.ros.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    InputView,
+    diagnostic_array,
+    notes,
+    warnings,
+    where_images_are,
+    why_no_input,
+)
+from bayes3d_ros.ros.parameters import (
+    OBJECT_LEARNER_SETTINGS,
+    DepthInputSettings,
+    ObjectLearnerNodeSettings,
+    Settings,
+    SettingsParameters,
+)
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.summary import key_values
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_INPUTS = ("qos_reliability", "table_frame", "camera_pose", "patience")
+_INPUTS = tuple(f.name for f in fields(DepthInputSettings))
 
 
 _Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
@@ -69,7 +85,7 @@ class ObjectLearnerNode(Node):
         self.add_post_set_parameters_callback(self._after_set_parameters)
         self._open_inputs()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.05, self._tick, clock=steady)
+        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
 
     def stop(self, timeout: float) -> bool:
@@ -84,7 +100,7 @@ class ObjectLearnerNode(Node):
         def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
                 response.success, response.message = True, action()
-            except (Refusal, LearningError, CaptureError, ViewError) as error:
+            except (Refusal, LearningError, CaptureError, ViewError, LibraryError) as error:
                 response.success, response.message = False, str(error)
             except OSError as error:
                 why = f"{error.filename or 'disk'}: {error.strerror or error}"
@@ -127,9 +143,10 @@ class ObjectLearnerNode(Node):
         frames, problems = store.load()
         if not frames:
             raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
+        replace = self._may_replace(store.folder.name, {frame.stamp_ns for frame in frames})
         self.get_logger().info(f"building {store.folder.name} from {len(frames)} view{'s' * (len(frames) != 1)}")
         learned = learn(frames[:MOST_VIEWS], store.folder.name, settings)
-        path = save_model(learned.model, self._library(), replace=True)
+        path = save_model(learned.model, self._library(), replace=replace)
         self._publish(learned, frames[-1].stamp_ns)
         used = sum(not view.refused for view in learned.views)
         size = " x ".join(f"{v:.3f}" for v in learned.model.box_size)
@@ -140,6 +157,17 @@ class ObjectLearnerNode(Node):
             f"camera poses corrected by up to {1e3 * off:.0f} mm"
         )
         return "; ".join([done, *refused, *problems])
+
+    def _may_replace(self, name: str, captured: set[int]) -> bool:
+        """Whether a model may be written over: where `replace` says so, or where it was learned from views that are all
+        among the captures (stamps), so that nothing is lost. Raises LibraryError for another one."""
+        library = self._library()
+        path = model_path(library, name)
+        before = learned_from(load_model(path)) if path.exists() else set()
+        if self._node_settings().replace or (before and before <= captured):
+            return True
+        refuse_existing(library, name)
+        return False
 
     def _reset(self) -> str:
         store = self._store()
@@ -168,10 +196,6 @@ class ObjectLearnerNode(Node):
         name = self._node_settings().object_name
         if not name:
             raise Refusal("parameter object_name is not set: expected what to call the object")
-        try:
-            check_name(name)
-        except LearningError as error:
-            raise Refusal(f"parameter object_{error}") from None
         return CaptureStore(self._library() / "captures" / name)
 
     def _captured(self, store: CaptureStore, settings: LearnerSettings) -> dict[int, Thing]:
@@ -194,15 +218,19 @@ class ObjectLearnerNode(Node):
         settings, messages = self._node_settings(), self._newest
         assert self._inputs is not None
         if messages is None:
-            raise Refusal(why_no_input(self._inputs.view()) or "no image with its CameraInfo has come yet")
+            view = self._inputs.view()
+            raise Refusal(why_no_input(view) or f"no image is complete yet: {where_images_are(view)}")
         age = time.monotonic() - messages.arrived
         if age > settings.max_age:
             why = why_no_input(self._inputs.view())
             raise Refusal(f"the newest image came {age:.1f} s ago" + (f": {why}" if why else ""))
         try:
-            return frame_from_messages(messages.image, messages.info, messages.T_table_camera)
+            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
         except ValueError as error:
             raise Refusal(str(error)) from None
+        if frame.T_table_camera is None and messages.pose.problem:
+            raise Refusal(f"no camera pose for this view, a learner needs one: {messages.pose.problem}")
+        return frame
 
     def _publish(self, learned: Learned, stamp_ns: int) -> None:
         """The model's surface where it stood, in table_frame."""
@@ -224,15 +252,7 @@ class ObjectLearnerNode(Node):
         except ValueError as error:
             self.get_logger().error(str(error))
             settings = ObjectLearnerNodeSettings()
-        self._inputs = DepthInputs(
-            self,
-            self._keep,
-            reliability=settings.qos_reliability,
-            table_frame=settings.table_frame,
-            fixed_pose=settings.camera_pose,
-            use_pose=True,
-            patience=settings.patience,
-        )
+        self._inputs = DepthInputs(self, self._keep, settings, use_pose="required")
 
     def _keep(self, messages: DepthMessages) -> None:
         self._newest = messages
@@ -255,28 +275,42 @@ class ObjectLearnerNode(Node):
 
     def _report(self) -> None:
         assert self._inputs is not None
-        level, message = OK, "ready to capture"
-        if self._settings.problems:
-            level, message = ERROR, "; ".join(self._settings.problems.values())
-        elif why := why_no_input(self._inputs.view()):
-            level, message = WARN, why
-        elif self._newest is not None and self._newest.T_table_camera is None:
-            level, message = WARN, "no camera pose for the newest image (camera_pose topic, tf or parameter)"
+        view = self._inputs.view()
+        level, message = self._why(view)
         stamp = "none" if self._newest is None else str(stamp_to_ns(self._newest.image.header.stamp))
-        if self._newest is not None and self._newest.T_table_camera is None:
+        if self._newest is not None and self._newest.pose.T_table_camera is None:
             stamp += ", without a camera pose"
         name = f"{self.get_fully_qualified_name()}: object learning"
         status = DiagnosticStatus(name=name, level=level, message=message, hardware_id="none")
         status.values = key_values(
             newest_stamp=stamp,
             received=str(self._inputs.received),
+            complete=str(self._inputs.delivered),
             dropped=str(self._inputs.dropped),
-            notes=self._inputs.notes(),
+            waiting=str(view.waiting),
+            camera_pose=view.pose_source,
+            notes="; ".join([*warnings(view), *notes(view)]),
             last=self._last,
         )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = Clock().now().to_msg()
-        self._diagnostics.publish(array)
+        self._diagnostics.publish(diagnostic_array(status))
+
+    def _why(self, view: InputView) -> tuple[bytes, str]:
+        """The level and the one line that says whether a view can be captured, and if not, why."""
+        if self._settings.problems:
+            return ERROR, "; ".join(self._settings.problems.values())
+        if why := why_no_input(view):
+            return WARN, why
+        if self._newest is None or not view.delivering:
+            return WARN, f"no image is complete: {where_images_are(view)}"
+        try:
+            frame_from_messages(self._newest.image, self._newest.info)
+        except ValueError as error:
+            return WARN, str(error)
+        if self._newest.pose.T_table_camera is None:
+            why = self._newest.pose.problem or "expected one from the camera_pose topic, tf or the parameter"
+            return WARN, f"no camera pose for the newest image: {why}"
+        told = warnings(view)
+        return (WARN, f"ready to capture; {'; '.join(told)}") if told else (OK, "ready to capture")
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,6 +1,7 @@
 """ROS parameters, their descriptors and the yaml files, all derived from the dataclasses of settings."""
 
 import math
+import re
 import sys
 import textwrap
 from dataclasses import MISSING, Field, dataclass, fields
@@ -12,6 +13,7 @@ from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeExce
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from bayes3d_ros.inference.object_learning import LearningError, check_name
 from bayes3d_ros.inference.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 from bayes3d_ros.ros.conversions import matrix_from_values
 
@@ -33,6 +35,21 @@ class DepthInputSettings:
     )
     patience: float = setting(
         0.5, "how long an image waits for its CameraInfo and camera pose", unit="s", low=0.0, high=10.0
+    )
+    pose_max_gap: float = setting(
+        0.2,
+        "longest gap between two poses on camera_pose between which the pose of an image is interpolated",
+        unit="s",
+        low=0.0,
+        high=10.0,
+    )
+    pose_tolerance: float = setting(
+        0.05,
+        "largest difference between the stamps of an image and of the nearest pose, which serves where none can be "
+        "interpolated when the image has waited for `patience`",
+        unit="s",
+        low=0.0,
+        high=10.0,
     )
 
     def __post_init__(self) -> None:
@@ -60,9 +77,20 @@ class ObjectLearnerNodeSettings(DepthInputSettings):
 
     library: str = setting("", "folder of object models; captures are kept in its subfolder captures/OBJECT_NAME")
     object_name: str = setting("", "what to call the object: letters, digits, '_' and '-'")
+    replace: bool = setting(
+        False, "write over a model of this name that the library held before; without it ~/build refuses"
+    )
     max_age: float = setting(
         2.0, "the newest image is not captured if it came longer ago than this", unit="s", low=0.1, high=3600.0
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.object_name:
+            try:
+                check_name(self.object_name)
+            except LearningError as error:
+                raise ValueError(f"object_{error}") from None
 
 
 @dataclass(frozen=True)
@@ -83,6 +111,8 @@ NODE_SETTINGS = {
     "object_learner": OBJECT_LEARNER_SETTINGS,
     "camera_tracker": CAMERA_TRACKER_SETTINGS,
 }
+# Those of an active node that are taken when they are set; the others of its inputs wait for the next activation.
+INPUT_PARAMETERS = ("camera_pose", "pose_max_gap", "pose_tolerance")
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
 
 
@@ -90,7 +120,7 @@ class SettingsParameters:
     """Declares the fields of settings dataclasses as a node's parameters, keeps them valid and reads them back.
 
     A value from a file or the command line that is wrong does not stop the node: the default stands in for it and
-    `problems` says what is wrong, until the parameter is set again.
+    `problems` says of each what is wrong, until that parameter is set again.
     """
 
     def __init__(self, node: Node, kinds: tuple[type, ...]) -> None:
@@ -99,6 +129,8 @@ class SettingsParameters:
         for kind in kinds:
             for field in fields(kind):
                 self._declare(field)
+        for kind in kinds:
+            self._replace_invalid(kind)
 
     def read(self, kind: type[Settings]) -> Settings:
         """The settings as they are now. ValueError with one line naming the parameter."""
@@ -132,9 +164,26 @@ class SettingsParameters:
         except ValueError as error:
             self.problems[field.name] = f"parameter {error}"
         if field.name in self.problems:
-            if self._node.has_parameter(field.name):
-                self._node.undeclare_parameter(field.name)
-            self._node.declare_parameter(field.name, default, descriptor, ignore_override=True)
+            self._use_default(field)
+
+    def _replace_invalid(self, kind: type) -> None:
+        """Put defaults where the dataclass refuses a value, one after the other: it names one at a time."""
+        named = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+        while True:
+            try:
+                self._build(kind, {})
+                return
+            except ValueError as error:
+                name = re.split(r"\W", str(error), maxsplit=1)[0]  # errors begin with the setting's name
+                if name not in named or name in self.problems:
+                    raise
+                self.problems[name] = f"parameter {error}"
+                self._use_default(named[name])
+
+    def _use_default(self, field: Field) -> None:
+        if self._node.has_parameter(field.name):
+            self._node.undeclare_parameter(field.name)
+        self._node.declare_parameter(field.name, parameter_value(field), describe(field), ignore_override=True)
 
     def _build(self, kind: type[Settings], changed: dict[str, Any]) -> Settings:
         values = {}
@@ -200,7 +249,7 @@ def yaml_text(node_name: str, kinds: tuple[type, ...]) -> str:
     lines = [
         f"# Parameters of {node_name} and their defaults. Written by `python -m bayes3d_ros.ros.parameters NODE`;",
         "# a test compares this file with the settings' dataclasses.",
-        f"/**/{node_name}:",
+        "/**:  # whatever the node is called",
         "  ros__parameters:",
     ]
     for kind in kinds:

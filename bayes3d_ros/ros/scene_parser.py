@@ -5,7 +5,7 @@ import os
 import sys
 import time
 import traceback
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,12 +19,14 @@ from bayes3d_ros.inference.compilation import enable_cache
 from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
+from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, WARN, Health, one_line, why_no_input
+from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, Health, InputView, judge, one_line
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
+    INPUT_PARAMETERS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
     SettingsParameters,
@@ -61,7 +63,7 @@ class SceneParserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._after_set_parameters)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.05, self._tick, clock=steady)
+        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         if self.get_parameter("autostart").value:
             self._prepare()
@@ -146,20 +148,22 @@ class SceneParserNode(Node):
             if request != self._requests:
                 return  # a later request is on its way
             try:
-                prepared = prepare(self._make_parser, library, settings, size)
-                if request == self._requests:
-                    self._ready = prepared
+                prepared, refusal = prepare(self._make_parser, library, settings, size), ""
             except Exception as error:
-                self._refusal = f"cannot compile the parser: {one_line(error)}"
+                prepared, refusal = None, f"cannot compile the parser: {one_line(error)}"
                 self.get_logger().debug(traceback.format_exc())
-            self._prepared.trigger()
+            if request == self._requests:  # else nobody wants it any more
+                self._ready, self._refusal = prepared or self._ready, refusal
+                self._prepared.trigger()
 
         self._worker.call(job)
         return ""
 
     def _on_prepared(self) -> None:
         """Runs on the executor when the worker has built a parser, or failed to."""
-        seconds = time.monotonic() - (self._preparing_since or time.monotonic())
+        if self._preparing_since is None:
+            return  # a cleanup came first
+        seconds = time.monotonic() - self._preparing_since
         self._preparing_since = None
         state = self._state_label()
         if self._refusal:
@@ -198,7 +202,7 @@ class SceneParserNode(Node):
     def _after_set_parameters(self, parameters: list[Parameter]) -> None:
         if self._ready is not None and any(p.name in _PARSER_PARAMETERS for p in parameters):
             self._prepare()
-        if self._inputs is not None and any(p.name in ("camera_pose", "table") for p in parameters):
+        if self._inputs is not None and any(p.name in (*INPUT_PARAMETERS, "table") for p in parameters):
             self._close_inputs()
             self._open_inputs()
 
@@ -207,21 +211,15 @@ class SceneParserNode(Node):
     def _open_inputs(self) -> None:
         assert self._ready is not None
         settings = self._settings.read(SceneParserNodeSettings)
-        self._inputs = DepthInputs(
-            self,
-            self._worker.submit,
-            reliability=settings.qos_reliability,
-            table_frame=settings.table_frame,
-            fixed_pose=settings.camera_pose,
-            use_pose=self._settings.read(ParserSettings).table != "depth",
-            patience=settings.patience,
-        )
+        use_pose = {"depth": "no", "auto": "yes", "pose": "required"}[self._settings.read(ParserSettings).table]
+        self._inputs = DepthInputs(self, self._worker.submit, settings, use_pose)
+        self._health.begin()
 
     def _close_inputs(self) -> None:
         if self._inputs is not None:
+            self._inputs.close()
             self._received_before += self._inputs.received
             self._dropped_before += self._inputs.dropped
-            self._inputs.close()
             self._inputs = None
         self._worker.forget()
 
@@ -233,26 +231,33 @@ class SceneParserNode(Node):
         """On the worker's thread: one frame from messages to messages."""
         ready = self._ready
         if ready is None or self._inputs is None:
+            self._health.discard()
             return
         try:
-            frame = frame_from_messages(messages.image, messages.info, messages.T_table_camera)
-        except ValueError as error:
-            self._problem(str(error))
-            return
-        try:
-            posterior = ready.parser.parse(frame)
-        except ParseError as error:
-            self._problem(str(error))
+            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
+            with self._working(ready, frame):
+                posterior = ready.parser.parse(frame)
+        except (ValueError, ParseError) as error:
+            self._problem(str(error), messages.pose.problem if ready.parser.settings.table == "pose" else "")
             return
         self._outputs.scene(posterior, ready.parser.library, ready.markers)
         self._health.output(posterior.seconds, posterior.ess, time.monotonic() - messages.arrived)
+
+    def _working(self, ready: Prepared, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
+        """What the node does meanwhile, for diagnostics."""
+        height, width = frame.depth.shape
+        if ready.parser.compiled_for(width, height):
+            return self._health.doing("parsing one frame", usual=QUIET)
+        self.get_logger().info(f"compiling for images of {width}x{height}")
+        return self._health.doing(f"compiling for images of {width}x{height}")
 
     def _worker_failed(self, error: Exception) -> None:
         self._problem(f"internal error, please report it: {one_line(error)}")
         self.get_logger().debug("".join(traceback.format_exception(error)))
 
-    def _problem(self, text: str) -> None:
-        if self._health.problem(text):
+    def _problem(self, what: str, why: str = "") -> None:
+        text = f"{what} ({why})" if why else what
+        if self._health.problem(text, kind=what):
             self.get_logger().warning(f"no output: {text}")
 
     # Diagnostics
@@ -262,7 +267,8 @@ class SceneParserNode(Node):
 
     def _report(self) -> None:
         inputs = self._inputs
-        level, message = self._why()
+        view = None if inputs is None else self._view(inputs)
+        level, message = self._why(view)
         if self._ready is not None:
             self._health.backend = self._ready.backend
         report = self._health.report(
@@ -272,22 +278,25 @@ class SceneParserNode(Node):
             state=self._state_label(),
             received=self._received_before + (inputs.received if inputs else 0),
             dropped=self._dropped_before + self._worker.dropped + (inputs.dropped if inputs else 0),
-            notes=inputs.notes() if inputs else "",
+            view=view,
         )
         self._diagnostics.publish(report)
 
-    def _why(self) -> tuple[bytes, str]:
+    def _view(self, inputs: DepthInputs) -> InputView:
+        """Without any pose the parser finds the table in the depth image, if it may."""
+        view = inputs.view()
+        found = view.pose_source == "none" and self.get_parameter("table").value != "pose"
+        return replace(view, pose_source="depth") if found else view
+
+    def _why(self, view: InputView | None) -> tuple[bytes, str]:
         """The level and the one line that says whether there is output, and if not, why."""
         if self._refusal:
             return ERROR, self._refusal
         if self._preparing_since is not None:
             return WARN, f"compiling for the library, {time.monotonic() - self._preparing_since:.0f} s so far"
-        if self._inputs is None:
+        if view is None:
             return WARN, f"the node is {self._state_label()}; configure and activate it"
-        why = self._health.recent_problem()
-        if self._worker.idle:
-            why = why_no_input(self._inputs.view()) or why
-        return (WARN, why) if why else (OK, "parsing")
+        return judge(self._health, view, idle=self._worker.idle, good="parsing")
 
 
 def main(args: list[str] | None = None) -> int:

@@ -48,6 +48,7 @@ class NewestWorker(Generic[T]):
     def forget(self) -> None:
         """Drop the item that waits."""
         with self._changed:
+            self.dropped += len(self._item)
             self._item = []
 
     def stop(self, timeout: float) -> bool:

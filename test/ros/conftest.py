@@ -94,6 +94,11 @@ class Ros:
             self._executor.spin_once(timeout_sec=pause)
         return result
 
+    def spin_until(self, moment: float) -> None:
+        """Spin until time.monotonic() reaches a moment."""
+        while (left := moment - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
     def wait_for_diagnosis(
         self, diagnostics: list[DiagnosticArray], text: str, name: str = "/scene_parser: scene parsing"
     ) -> DiagnosticArray:
@@ -153,6 +158,10 @@ class Camera:
             self._info.publish(info)
         self._image.publish(image)
 
+    def send_info(self, info: CameraInfo) -> None:
+        """Publish a CameraInfo alone."""
+        self._info.publish(info)
+
     def publish(self, frame: DepthFrame) -> None:
         """Publish a frame."""
         self.send(*self.messages(frame))
@@ -177,7 +186,11 @@ def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
 @pytest.fixture(scope="session")
 def library_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two boxes."""
-    folder = tmp_path_factory.mktemp("library")
+    return make_library(tmp_path_factory.mktemp("library"))
+
+
+def make_library(folder: Path) -> Path:
+    """Models of two boxes in a folder."""
     for name, size in (("brick", (0.06, 0.1, 0.2)), ("cube", (0.08, 0.08, 0.08))):
         save_model(model_from_mesh(trimesh.creation.box(size), name, 0.01), folder)
     return folder

@@ -1,4 +1,5 @@
-"""The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] --ros-args ...`."""
+"""The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] [--compiling S] --ros-args
+...`; seconds for every frame, and for the first one of every size."""
 
 import sys
 import threading
@@ -17,19 +18,26 @@ class FakeParser:
     """Answers every frame with one object of type 0, one metre ahead (or at the camera pose's height)."""
 
     seconds = 0.0
+    compiling = 0.0
 
     def __init__(self, library: Library, settings: ParserSettings) -> None:
         self.library, self.settings = library, settings
+        self._sizes: set[tuple[int, int]] = set()
 
     def warm_up(self, width: int, height: int) -> None:
-        pass
+        self._sizes.add((width, height))
+
+    def compiled_for(self, width: int, height: int) -> bool:
+        return not self.compiling or (width, height) in self._sizes
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
-        threading.Event().wait(self.seconds)
+        height, width = frame.depth.shape
+        threading.Event().wait(self.seconds + (0.0 if self.compiled_for(width, height) else self.compiling))
+        self.warm_up(width, height)
         if not np.isfinite(frame.depth).any():
             raise ParseError("depth image: no pixel has a return")
         if self.settings.table == "pose" and frame.T_table_camera is None:
-            raise ParseError("table is 'pose' and the frame has no camera pose")
+            raise ParseError("no camera pose for this frame, and table:=pose expects one")
         z = 1.0 if frame.T_table_camera is None else float(frame.T_table_camera[2, 3])
         position, orientation = np.array([0.0, 0.1, z]), np.array([0.0, 0.0, 0.0, 1.0])
         samples = SceneSamples(  # two samples: one object, none
@@ -64,7 +72,7 @@ class FakeParser:
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    if arguments[:1] == ["--seconds"]:
-        FakeParser.seconds = float(arguments[1])
+    options = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=False))
+    FakeParser.seconds = float(options.get("--seconds", 0))
+    FakeParser.compiling = float(options.get("--compiling", 0))
     sys.exit(run(lambda: SceneParserNode(FakeParser), sys.argv))

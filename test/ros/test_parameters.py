@@ -12,6 +12,7 @@ from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.parameters import (
     NODE_SETTINGS,
+    OBJECT_LEARNER_SETTINGS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
     SettingsParameters,
@@ -48,7 +49,7 @@ def test_the_yaml_file_is_in_step_with_the_settings(node: str) -> None:
     file = share_directory() / "config" / f"{node}.yaml"
     expected = yaml_text(node, NODE_SETTINGS[node])
     assert file.read_text() == expected, f"python -m bayes3d_ros.ros.parameters {node} > {file}"
-    values = yaml.safe_load(expected)[f"/**/{node}"]["ros__parameters"]
+    values = yaml.safe_load(expected)["/**"]["ros__parameters"]
     assert values.keys() == {f.name for kind in NODE_SETTINGS[node] for f in fields(kind)}
     core = asdict(NODE_SETTINGS[node][1]())
     assert {k: values[k] for k in core} == core
@@ -143,4 +144,47 @@ def test_a_parameter_file_reaches_a_node_in_a_namespace(context: rclpy.Context, 
     parameters = SettingsParameters(node, SCENE_PARSER_SETTINGS)
     assert parameters.read(ParserSettings) == ParserSettings(max_objects=5)
     assert parameters.read(SceneParserNodeSettings) == SceneParserNodeSettings()
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("declared", [with_values("window:=4", "near:=6.0", "table:=chair")], indirect=True)
+def test_all_bad_values_at_the_start_are_named_and_each_can_be_set_right_alone(
+    declared: tuple[Node, SettingsParameters],
+) -> None:
+    node, parameters = declared
+    names = ["table", "window", "near"]
+    while names:
+        with pytest.raises(ValueError) as error:
+            parameters.read(ParserSettings)
+        assert str(error.value).count("parameter ") == len(names)
+        assert all(f"parameter {name} " in str(error.value) for name in names)
+        name = names.pop()
+        right = getattr(ParserSettings(), name)
+        assert node.set_parameters([Parameter(name, value=right)])[0].successful
+    assert parameters.read(ParserSettings) == ParserSettings()
+
+
+@pytest.mark.parametrize("declared", [with_values("near:=6.0", "far:=8.0")], indirect=True)
+def test_values_that_are_right_together_are_taken(declared: tuple[Node, SettingsParameters]) -> None:
+    assert declared[1].read(ParserSettings) == ParserSettings(near=6.0, far=8.0)
+
+
+def test_a_name_for_an_object_is_checked_when_it_is_set(context: rclpy.Context) -> None:
+    node = Node("object_learner", context=context)
+    parameters = SettingsParameters(node, OBJECT_LEARNER_SETTINGS)
+    node.add_on_set_parameters_callback(parameters.check)
+    result = node.set_parameters([Parameter("object_name", value="../up")])[0]
+    assert not result.successful and "object_name: expected letters" in result.reason
+    assert node.set_parameters([Parameter("object_name", value="mug_2")])[0].successful
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("later", [["-p", "max_objects:=2"], ["-p", "renamed:max_objects:=2"]])
+def test_a_parameter_file_reaches_a_renamed_node_and_the_command_line_wins(context: rclpy.Context, later) -> None:
+    file = share_directory() / "config" / "scene_parser.yaml"
+    arguments = ["--ros-args", "-r", "__node:=renamed", "--params-file", str(file), *later]
+    node = Node("scene_parser", context=context, cli_args=arguments)
+    assert node._parameter_overrides.keys() >= {f.name for f in fields(ParserSettings)}
+    parameters = SettingsParameters(node, SCENE_PARSER_SETTINGS)
+    assert parameters.read(ParserSettings) == ParserSettings(max_objects=2)
     node.destroy_node()

@@ -1,0 +1,244 @@
+"""Where the camera stands: from the camera_pose topic, from tf, or from parameters, in that order."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from jaxtyping import Float
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.time import Time
+
+from bayes3d_ros.ros.conversions import matrix_from_values, pose_to_matrix, stamp_to_ns
+from bayes3d_ros.ros.pose_history import PoseHistory
+from bayes3d_ros.ros.subscriptions import AutoSubscription
+
+try:
+    import tf2_ros  # not on PyPI; comes with an installed ROS
+except ImportError:
+    tf2_ros = None
+
+_JUMP = 1.0  # seconds backwards, after which tf is heard anew
+_HISTORY = 2.0  # seconds of poses that are kept beyond `patience`
+
+
+class CameraPose(NamedTuple):
+    """T_table_camera (table frame: z up, origin on the table; camera optical frame) of an image, or None.
+
+    `source`: topic, tf, parameter or none. `problem`: why the topic or tf has no pose though one of them should.
+    """
+
+    T_table_camera: Float[np.ndarray, "4 4"] | None
+    source: str
+    problem: str = ""
+
+
+NO_POSE = CameraPose(None, "none")
+
+
+class CameraPoseSource:
+    """The camera's pose for the stamps of images.
+
+    Topic and tf: the pose of the stamp, or one interpolated between its neighbours; on the topic these may be at most
+    `max_gap` seconds apart. When an image has waited long enough: the nearest pose, at most `tolerance` seconds away.
+    Nothing is extrapolated, and a pose is not used for other stamps, unless it is static: of stamp 0, of a latched
+    publisher, of /tf_static, or the parameter's, which counts only where neither the topic nor tf is in use.
+
+    `required`: an image waits for its pose even if nobody seems to send one. `on_pose` is called after every pose.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        table_frame: str,
+        fixed_pose: tuple[float, ...],
+        reliability: str,
+        patience: float,
+        max_gap: float,
+        tolerance: float,
+        required: bool,
+        on_pose: Callable[[], None],
+    ) -> None:
+        self._table_frame, self._tolerance, self._on_new = table_frame, tolerance, on_pose
+        self._fixed = matrix_from_values(list(fixed_pose)) if fixed_pose else None
+        self._required = required and self._fixed is None
+        self._history = PoseHistory(max_gap, patience + _HISTORY)
+        self.refused = ""  # what is wrong with the newest message on the topic
+        self._topic = AutoSubscription(
+            node, PoseStamped, "camera_pose", self._on_pose, reliability=reliability, depth=100, latched=True
+        )
+        self._tf = None if tf2_ros is None else _Tf(node, table_frame)
+
+    @property
+    def topic(self) -> str:
+        """The resolved name of the topic."""
+        return self._topic.topic
+
+    @property
+    def publishers(self) -> tuple[str, ...]:
+        """The nodes that publish poses on the topic."""
+        return self._topic.publishers
+
+    def tick(self) -> None:
+        """To be called often."""
+        self._topic.tick()
+        if self._tf is not None:
+            self._tf.tick()
+
+    def images_jumped(self) -> None:
+        """The stamps of images have jumped back: poses of before do not count any more."""
+        self._history.forget_before(time.monotonic() - _JUMP)
+        if self._tf is not None:
+            self._tf.renew()
+
+    def find(self, stamp_ns: int, camera_frame: str, last: bool) -> CameraPose | None:
+        """The pose at a stamp; None while a better one may come, which is never so for the `last` question."""
+        pose = self._history.at(stamp_ns)
+        if pose is not None:
+            return CameraPose(pose, "topic")
+        if self._history.static is not None and not self._history.moving:
+            return CameraPose(self._history.static, "topic")
+        pose = None if self._tf is None else self._tf.lookup(stamp_ns, camera_frame)
+        if pose is not None:
+            return CameraPose(pose, "tf")
+        if not last and self._awaited(camera_frame):
+            return None
+        return self._fallback(stamp_ns, camera_frame)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._topic.close()
+        if self._tf is not None:
+            self._tf.close()
+
+    def _on_pose(self, message: PoseStamped, latched: bool) -> None:
+        """Take a pose from the topic; one that cannot be used is left out and named in `refused`."""
+        frame = message.header.frame_id
+        if frame not in ("", self._table_frame):
+            self.refused = f"{self.topic}: expected frame_id {self._table_frame!r} (table_frame), got {frame!r}"
+            return
+        try:
+            pose = pose_to_matrix(message.pose)
+        except ValueError as error:
+            self.refused = f"{self.topic}: {error}"
+            return
+        self.refused = ""
+        self._history.add(stamp_to_ns(message.header.stamp), pose, time.monotonic(), latched)
+        self._on_new()
+
+    def _awaited(self, camera_frame: str) -> bool:
+        """Whether a pose for an image may still come."""
+        return bool(self.publishers) or self._required or (self._tf is not None and self._tf.connects(camera_frame))
+
+    def _fallback(self, stamp_ns: int, camera_frame: str) -> CameraPose:
+        """The best pose for a stamp that neither the topic nor tf knows."""
+        nearest = self._history.nearest(stamp_ns)
+        if nearest is not None and abs(nearest.seconds) <= self._tolerance:
+            return CameraPose(nearest.pose, "topic")
+        pose = None if self._tf is None else self._tf.latest(stamp_ns, camera_frame, self._tolerance)
+        if pose is not None:
+            return CameraPose(pose, "tf")
+        if self._history.static is not None:
+            return CameraPose(self._history.static, "topic")
+        problem = self._why_none(stamp_ns, camera_frame)
+        if problem or self._fixed is None:
+            return CameraPose(None, "none", problem)
+        return CameraPose(self._fixed, "parameter")
+
+    def _why_none(self, stamp_ns: int, camera_frame: str) -> str:
+        """Why there is no pose on the topic, or in tf; empty where neither is in use."""
+        reasons = []
+        nearest = self._history.nearest(stamp_ns)
+        if self.refused:
+            reasons.append(self.refused)
+        elif nearest is not None:
+            side = "older" if nearest.seconds < 0 else "newer"
+            reasons.append(
+                f"{self.topic}: the nearest pose is {abs(nearest.seconds):.3f} s {side} than the image, more than "
+                f"pose_tolerance, {self._tolerance:g} s"
+            )
+        elif self.publishers:
+            reasons.append(f"{self.topic}: no pose yet from {', '.join(sorted(set(self.publishers)))}")
+        elif self._required:
+            reasons.append(f"{self.topic}: no publisher")
+        in_use = self._tf is not None and self._tf.connects(camera_frame)
+        if self._tf is not None and (in_use or (self._required and not reasons)):
+            reasons.append(self._tf.why(stamp_ns, camera_frame))
+        elif self._required and self._tf is None:
+            reasons.append("tf: tf2_ros is not installed")
+        return "; ".join(reasons)
+
+
+class _Tf:
+    """The camera's pose in tf. It is asked and never waited for."""
+
+    def __init__(self, node: Node, table_frame: str) -> None:
+        self._node, self._table_frame = node, table_frame
+        self._renew, self._renewed = False, -_JUMP
+        backwards = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-_JUMP), on_clock_change=True)
+        self._clock_jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
+        self._listen()
+
+    def lookup(self, stamp_ns: int, camera_frame: str) -> Float[np.ndarray, "4 4"] | None:
+        """The pose at a stamp as tf2 knows it: exact, interpolated or static."""
+        return self._ask(Time(nanoseconds=stamp_ns), camera_frame)[0]
+
+    def latest(self, stamp_ns: int, camera_frame: str, tolerance: float) -> Float[np.ndarray, "4 4"] | None:
+        """The newest pose, if its stamp is at most `tolerance` seconds from an image's."""
+        pose, newest = self._ask(Time(), camera_frame)
+        return pose if abs(newest - stamp_ns) <= tolerance * 1e9 else None
+
+    def connects(self, camera_frame: str) -> bool:
+        """Whether tf knows how the camera and the table are connected, at any time."""
+        return self._ask(Time(), camera_frame)[0] is not None
+
+    def why(self, stamp_ns: int, camera_frame: str) -> str:
+        """Why there is no pose: tf2's own words, and both frames."""
+        asked = f"tf {self._table_frame!r} <- {camera_frame!r}"
+        try:
+            self._buffer.lookup_transform(self._table_frame, camera_frame, Time(nanoseconds=stamp_ns))
+        except tf2_ros.TransformException as error:
+            return f"{asked}: {' '.join(str(error).split())}"
+        return f"{asked}: it came too late"
+
+    def renew(self) -> None:
+        """Hear tf anew at the next tick: what the buffer holds is of before a jump, and it refuses what is older.
+        (To clear it would lose /tf_static, which is sent only once to each listener.)"""
+        self._renew = True
+
+    def tick(self) -> None:
+        """To be called often."""
+        now = time.monotonic()
+        if self._renew and now - self._renewed >= _JUMP:
+            self._renew, self._renewed = False, now
+            self._listener.unregister()
+            self._listen()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._clock_jumps.unregister()
+        self._listener.unregister()
+
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        self.renew()
+
+    def _listen(self) -> None:
+        self._buffer: Any = tf2_ros.Buffer()
+        self._listener: Any = tf2_ros.TransformListener(self._buffer, self._node, spin_thread=False)
+
+    def _ask(self, stamp: Time, camera_frame: str) -> tuple[Float[np.ndarray, "4 4"] | None, int]:
+        """The pose and its stamp in nanoseconds."""
+        try:
+            found = self._buffer.lookup_transform(self._table_frame, camera_frame, stamp)
+        except tf2_ros.TransformException:
+            return None, 0
+        p, q = found.transform.translation, found.transform.rotation
+        try:
+            pose = matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+        except ValueError:
+            return None, 0
+        return pose, stamp_to_ns(found.header.stamp)

@@ -1,0 +1,133 @@
+"""Camera poses from a topic, and the pose at the stamp of an image."""
+
+from bisect import bisect_left, insort
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from bayes3d_ros.ros.input_queue import JUMP_NS
+
+Matrix = Float[np.ndarray, "4 4"]
+
+_MOST = 20_000  # poses
+_STREAM = 1.0  # seconds: latched poses that change faster than this belong to a camera that moves
+
+
+class Nearest(NamedTuple):
+    """The pose whose stamp is nearest to an image's; `seconds` is its stamp minus the image's."""
+
+    pose: Matrix
+    seconds: float
+
+
+class _Latched(NamedTuple):
+    stamp_ns: int
+    pose: Matrix
+    arrived: float
+
+
+class PoseHistory:
+    """T_table_camera by stamp, for `keep` seconds.
+
+    `static` is a pose that holds for any stamp: the last one with stamp 0, or the last one of a latched
+    (transient_local) publisher. Any other pose that comes later replaces it. `moving` says that latched poses follow
+    each other too quickly for a camera at rest.
+    """
+
+    def __init__(self, max_gap: float, keep: float) -> None:
+        self._max_gap_ns, self._keep_ns = int(max_gap * 1e9), int(keep * 1e9)
+        self._stamps: list[int] = []  # ascending
+        self._poses: dict[int, tuple[Matrix, float]] = {}  # the pose, and when it arrived
+        self._latched: _Latched | None = None
+        self._static: Matrix | None = None
+        self.moving = False
+
+    @property
+    def static(self) -> Matrix | None:
+        """The pose for any stamp, or None."""
+        return self._static
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no pose with a stamp."""
+        return not self._stamps
+
+    def add(self, stamp_ns: int, pose: Matrix, now: float, latched: bool) -> None:
+        """A pose that arrived at `now` (steady seconds). A latched publisher's poses may come twice, as latched and
+        not; the copy says nothing."""
+        if latched:
+            self._add_latched(stamp_ns, pose, now)
+        elif stamp_ns == 0:
+            self._static, self.moving = pose, False
+        elif not self._is_copy(stamp_ns, pose):
+            self._static = None
+        if stamp_ns != 0:
+            self._insert(stamp_ns, pose, now)
+
+    def at(self, stamp_ns: int) -> Matrix | None:
+        """The pose of a stamp: exact, or between two poses that are at most `max_gap` apart; never extrapolated."""
+        if stamp_ns in self._poses:
+            return self._poses[stamp_ns][0]
+        after = bisect_left(self._stamps, stamp_ns)
+        if after in (0, len(self._stamps)):
+            return None
+        before_ns, after_ns = self._stamps[after - 1], self._stamps[after]
+        if after_ns - before_ns > self._max_gap_ns:
+            return None
+        share = (stamp_ns - before_ns) / (after_ns - before_ns)
+        return interpolate(self._poses[before_ns][0], self._poses[after_ns][0], share)
+
+    def nearest(self, stamp_ns: int) -> Nearest | None:
+        """The pose of the nearest stamp, or None where there is no pose."""
+        if not self._stamps:
+            return None
+        after = bisect_left(self._stamps, stamp_ns)
+        near = min(self._stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp_ns))
+        return Nearest(self._poses[near][0], 1e-9 * (near - stamp_ns))
+
+    def forget_before(self, arrived: float) -> None:
+        """Forget the poses with a stamp that arrived before this time: they are of before a jump of the clock."""
+        self._keep_only([s for s in self._stamps if self._poses[s][1] >= arrived])
+
+    def _is_copy(self, stamp_ns: int, pose: Matrix) -> bool:
+        """Whether this is a latched pose that came before."""
+        latched = self._latched
+        return latched is not None and latched.stamp_ns >= stamp_ns and np.array_equal(self._known(stamp_ns), pose)
+
+    def _known(self, stamp_ns: int) -> Matrix:
+        known = self._poses.get(stamp_ns)
+        return np.full((4, 4), np.nan) if known is None else known[0]
+
+    def _add_latched(self, stamp_ns: int, pose: Matrix, now: float) -> None:
+        before = self._latched
+        if before is None or not np.array_equal(before.pose, pose):
+            self.moving = before is not None and now - before.arrived < _STREAM
+        elif now - before.arrived >= _STREAM:
+            self.moving = False
+        self._latched, self._static = _Latched(stamp_ns, pose, now), pose
+
+    def _insert(self, stamp_ns: int, pose: Matrix, now: float) -> None:
+        if self._stamps and stamp_ns <= self._stamps[-1] - JUMP_NS:
+            self._keep_only([])
+        if stamp_ns not in self._poses:
+            insort(self._stamps, stamp_ns)
+        self._poses[stamp_ns] = pose, now
+        first = max(bisect_left(self._stamps, self._stamps[-1] - self._keep_ns), len(self._stamps) - _MOST)
+        if first > 0:
+            for old in self._stamps[:first]:
+                del self._poses[old]
+            del self._stamps[:first]
+
+    def _keep_only(self, stamps: list[int]) -> None:
+        self._poses = {s: self._poses[s] for s in stamps}
+        self._stamps = stamps
+
+
+def interpolate(a: Matrix, b: Matrix, share: float) -> Matrix:
+    """The pose at `share` of the way from a to b: linear in the position, slerp in the orientation, as tf2 does."""
+    T = np.eye(4)
+    T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]])))(share).as_matrix()
+    return T
