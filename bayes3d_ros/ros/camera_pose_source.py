@@ -21,7 +21,8 @@ try:
 except ImportError:
     tf2_ros = None
 
-_JUMP = 1.0  # seconds backwards, after which tf is heard anew
+_JUMP = 1.0  # seconds backwards, after which tf is heard anew; of real time, in which that is done once
+_TF_MEMORY_NS = 10_000_000_000  # tf2 forgets, and refuses, what is this much older than the newest transform
 _HISTORY = 2.0  # seconds of poses that are kept beyond `patience`
 
 
@@ -190,6 +191,8 @@ class _Tf:
     def latest(self, stamp_ns: int, camera_frame: str, tolerance: float) -> Float[np.ndarray, "4 4"] | None:
         """The newest pose, if its stamp is at most `tolerance` seconds from an image's."""
         pose, newest = self._ask(Time(), camera_frame)
+        if newest > stamp_ns + _TF_MEMORY_NS:
+            self.renew()  # a transform of before a jump came after it
         return pose if abs(newest - stamp_ns) <= tolerance * 1e9 else None
 
     def connects(self, camera_frame: str) -> bool:
@@ -207,14 +210,14 @@ class _Tf:
 
     def renew(self) -> None:
         """Hear tf anew at the next tick: what the buffer holds is of before a jump, and it refuses what is older.
-        (To clear it would lose /tf_static, which is sent only once to each listener.)"""
-        self._renew = True
+        (To clear it would lose /tf_static, which is sent only once to each listener.) The clock and the images tell of
+        the same jump; to begin twice would lose what came meanwhile."""
+        self._renew |= time.monotonic() - self._renewed >= _JUMP
 
     def tick(self) -> None:
         """To be called often."""
-        now = time.monotonic()
-        if self._renew and now - self._renewed >= _JUMP:
-            self._renew, self._renewed = False, now
+        if self._renew:
+            self._renew, self._renewed = False, time.monotonic()
             self._listener.unregister()
             self._listen()
 
