@@ -143,6 +143,10 @@ class Camera:
         for publisher in (self._image, self._info):
             self._ros.wait_for(publisher.get_subscription_count, f"a subscriber of {publisher.topic}", seconds=60)
 
+    def subscribers(self) -> int:
+        """How many nodes subscribe to both."""
+        return min(publisher.get_subscription_count() for publisher in (self._image, self._info))
+
     def messages(self, frame: DepthFrame) -> tuple[Image, CameraInfo]:
         """The messages of a frame."""
         header = Header(stamp=ns_to_stamp(frame.stamp_ns), frame_id=frame.frame_id)
