@@ -76,6 +76,8 @@ def evidence_left(scene_depth: Float[Array, "H W"], image: Image, noise: Noise) 
     an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
     many = noise.p_outlier[0] > MANY_OUTLIERS
     depth, kind = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.kind)
+    if image.rows is not None:  # below the camera's last row the returns above it would agree on something
+        depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth
     apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
     unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)

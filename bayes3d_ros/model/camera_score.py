@@ -104,4 +104,5 @@ def render_cameras(
         return depth(_drawn(T_camera_world, world), None, image, library)
     shape = (len(T_camera_world), *image.depth.shape)
     rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
-    return depth_along(T_camera_world[:, None, None], world, library, rays)
+    own = jnp.arange(shape[1])[:, None] < image.own_rows
+    return jnp.where(own, depth_along(T_camera_world[:, None, None], world, library, rays), jnp.inf)

@@ -35,7 +35,7 @@ def draw_tiles(
 ) -> Float[Array, "B Hp Wp"]:
     """Hypotheses drawn into padded images, each where it is nearer than what is there; draw(n, rays) gives depth along
     rays (x, y, 1) of shape [h, w, chunk]. The first row's hypothesis is that of the first image."""
-    height, width = image.depth.shape
+    height, width = image.own_rows, image.depth.shape[1]
     step = jnp.arange(size.tile)[:, None]
     first = rows[0] // each
 

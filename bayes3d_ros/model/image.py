@@ -1,12 +1,14 @@
 """The observed depth image at scoring resolution, and the parts of it that are scored together."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.model.likelihood import NO_RETURN, Likelihood, Pixels
+from bayes3d_ros.model.observation import scored_size
 
 
 class FreePoints(NamedTuple):
@@ -19,7 +21,7 @@ class FreePoints(NamedTuple):
 
 
 class Image(NamedTuple):
-    """The observed depth at scoring resolution."""
+    """The observed depth at scoring resolution. The arrays may have more rows than the camera (see `scored_image`)."""
 
     depth: Float[Array, "H W"]  # metres, 0 where there is no return
     kind: Int[Array, "H W"]
@@ -33,6 +35,66 @@ class Image(NamedTuple):
     likelihood: Likelihood = Likelihood()
     weight: Float[Array, ""] | np.float32 = np.float32(1)  # share of every pixel's log likelihood that counts
     points: FreePoints | None = None  # scored in place of the depth image, of which the search still makes use
+    rows: Int[Array, ""] | np.int32 | None = None  # how many of the H are the camera's; None: all
+
+    @property
+    def own_rows(self) -> Int[Array, ""] | np.int32 | int:
+        """How many rows the camera has: below them nothing was observed, and nothing is drawn."""
+        return self.depth.shape[0] if self.rows is None else self.rows
+
+
+def padded_height(width: int, height: int) -> int:
+    """Rows of the arrays that hold an image of this size: as many as an image of 4:3 has, or a multiple of that.
+
+    Compiled code is for the arrays' shape. One shape serves all images from 4:3 to the widest, and another those down
+    to two columns for three rows.
+    """
+    step = max(1, round(0.75 * width))
+    return step * -(-height // step)
+
+
+def array_shape(width: int, height: int, score_width: int) -> tuple[int, int]:
+    """Rows and columns of the arrays in which an image of this size is scored."""
+    across, down = scored_size(width, height, score_width)
+    return padded_height(across, down), across
+
+
+def scored_image(
+    camera: Intrinsics,
+    depth: Float[np.ndarray, "height width"],
+    kind: Int[np.ndarray, "height width"],
+    table: Float[np.ndarray, "height width"],
+    near: float,
+    far: float,
+    sigma_max: float,
+    **more: Any,
+) -> Image:
+    """The image of a camera at scoring resolution, in arrays of `padded_height` rows: below the camera's nothing
+    returned. What is computed of the image does not depend on them. depth: metres, 0 where there is no return; table:
+    that of the bare table, inf where it is not seen; near, far, sigma_max: metres; `more`: other fields of the image.
+
+    All arrays are numpy's, to be put on a device: JAX would compile the padding itself for every size.
+    """
+    rays = camera.rays()
+    below = padded_height(camera.width, camera.height) - camera.height
+    rows_below = rays[-1, 0, 1] + np.arange(1, below + 1) / camera.fy
+
+    def grown(a: np.ndarray, kind: type, nothing: float) -> np.ndarray:
+        return np.pad(a.astype(kind), [(0, below), (0, 0)], constant_values=nothing)
+
+    fields: dict[str, Any] = {
+        "depth": grown(depth, np.float32, 0.0),
+        "kind": grown(kind, np.int32, NO_RETURN),
+        "ray_x": rays[0, :, 0].copy(),
+        "ray_y": np.concatenate([rays[:, 0, 1], rows_below]).astype(np.float32),
+        "focal": np.array([camera.fx, camera.fy], np.float32),
+        "centre": np.array([camera.cx, camera.cy], np.float32),
+        "table": grown(table, np.float32, np.inf),
+        "outlier_scale": np.float32(3 / (far**3 - near**3)),
+        "front_margin": np.float32(3 * sigma_max),
+        "rows": np.int32(camera.height),
+    }
+    return Image(**fields, **more)
 
 
 def halved(image: Image) -> Image:
@@ -46,6 +108,7 @@ def halved(image: Image) -> Image:
         centre=image.centre / 2,
         table=image.table[::2, ::2],
         points=None,  # good enough for a search
+        rows=None if image.rows is None else (image.rows + 1) // 2,
     )
 
 
@@ -60,7 +123,7 @@ def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
     """The observed pixels of tiles of a shape; those that stick out of the image have no return."""
     height, width = image.depth.shape
     rows, columns = (v + jnp.arange(shape[0])[:, None])[:, None], u + jnp.arange(shape[1])[:, None]
-    inside = (rows < height) & (columns < width)
+    inside = (rows < image.own_rows) & (columns < width)
     rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
     pixels = Pixels(
         depth=image.depth[rows, columns],

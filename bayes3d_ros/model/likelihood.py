@@ -159,12 +159,16 @@ likelihoods: dict[str, Callable] = {"depth": inlier_density, "points": point_den
 
 @partial(jax.jit, static_argnames="window")
 def log_likelihood(
-    rendered: Float[Array, "hr wr T"], pixels: Pixels, noise: Noise, window: int
+    rendered: Float[Array, "hr wr T"],
+    pixels: Pixels,
+    noise: Noise,
+    window: int,
+    rows: Int[Array, ""] | np.int32 | None = None,
 ) -> Float[Array, "S P T"]:
     """Sum over the pixels of each tile of the log likelihood, times their weight, for every pair of noise values.
-    Their number is a multiple of four; `rendered` has a border of window // 2 pixels around. Of free points a pixel
-    may hold several: then `pixels` has L times the tiles of `rendered`, all tiles of one layer after those of the
-    other."""
+    The pixels of a row are a multiple of four, or those of a tile are where all rows count (else the first `rows` do);
+    `rendered` has a border of window // 2 pixels around. Of free points a pixel may hold several: then `pixels` has L
+    times the tiles of `rendered`, all tiles of one layer after those of the other."""
     layers = pixels.depth.shape[-1] // rendered.shape[-1]
     rendered = jnp.concatenate([rendered] * layers, -1) if layers > 1 else rendered
     half = window // 2
@@ -174,7 +178,8 @@ def log_likelihood(
     tiles = outlier.shape[-1]
     at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
-    total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once)
+    count = inlier.shape[1] if rows is None else rows * width
+    total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once, count)
     return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
 
 
@@ -188,10 +193,15 @@ def by_kind(pixels: Pixels, rendered: Float[Array, "h w T"], inlier: Array) -> t
 
 
 def _sum_log(
-    outlier: Float[Array, "N T"], inlier: Float[Array, "S N T"], p: Float[Array, "P"], at_once: int
+    outlier: Float[Array, "N T"],
+    inlier: Float[Array, "S N T"],
+    p: Float[Array, "P"],
+    at_once: int,
+    count: Int[Array, ""] | np.int32 | int,
 ) -> Float[Array, "S P T"]:
-    """Sum of log(p outlier + (1 - p) inlier), through the logs of products of so many pixels. Scaled, so that products
-    stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre (four) or .. 1e15 (two)."""
+    """Sum of log(p outlier + (1 - p) inlier) over the first `count` pixels, through the logs of products of so many of
+    them. Scaled, so that products stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre (four) or ..
+    1e15 (two)."""
     outlier, inlier = _SCALE * outlier, _SCALE * inlier
     p = p[None, :, None]
 
@@ -202,4 +212,4 @@ def _sum_log(
         return total + (jnp.log(product) - at_once * jnp.log(_SCALE))
 
     start = jnp.zeros((inlier.shape[0], p.shape[1], outlier.shape[1]))
-    return jax.lax.fori_loop(0, outlier.shape[0] // at_once, product_of, start)
+    return jax.lax.fori_loop(0, count // at_once, product_of, start)

@@ -40,10 +40,15 @@ class Reduced(NamedTuple):
     trusted: Bool[np.ndarray, "height width"]  # and among returns that agree with it
 
 
-def reduced(frame: DepthFrame, width: int, near: float, far: float) -> Reduced:
-    """The frame `width` pixels across, no wider than it is; `near` and `far` in metres."""
-    width = min(width, frame.intrinsics.width)
-    height = max(1, round(width * frame.intrinsics.height / frame.intrinsics.width))
+def scored_size(width: int, height: int, score_width: int) -> tuple[int, int]:
+    """Width and height at which an image is scored: `score_width` pixels across, but no wider than it is."""
+    across = min(score_width, width)
+    return across, max(1, round(across * height / width))
+
+
+def reduced(frame: DepthFrame, score_width: int, near: float, far: float) -> Reduced:
+    """The frame at the size at which it is scored; `near` and `far` in metres."""
+    width, height = scored_size(frame.intrinsics.width, frame.intrinsics.height, score_width)
     depth = resize_depth(frame.depth, width, height)
     with np.errstate(invalid="ignore"):
         returned = np.isfinite(depth) & (depth >= near) & (depth <= far)

@@ -118,6 +118,6 @@ def log_likelihood_scene(
 
     def one(scene: Float[Array, "Hp Wp"]) -> Float[Array, "S P"]:
         rendered = scene[: tall + 2 * half, : wide + 2 * half, None]
-        return log_likelihood(rendered, pixels, noise, window)[..., 0]
+        return log_likelihood(rendered, pixels, noise, window, image.rows)[..., 0]
 
     return jax.lax.map(one, scenes)

@@ -81,7 +81,7 @@ def tiles_of_objects(
         out = ~ahead.reshape(*ahead.shape, *[1] * (low.ndim - 2))
         return jnp.where(out, jnp.inf, low).min(1), jnp.where(out, -jnp.inf, high).max(1)
 
-    top, bottom = pixels(*around(v.min(2), v.max(2)), height)
+    top, bottom = pixels(*around(v.min(2), v.max(2)), image.own_rows)
     row = top[:, None] + tile * jnp.arange(-(-height // tile))
     # The outline between the first and the last line of pixels that the row's windows see.
     low, high = (a[:, None, :, None] for a in (row - half - ROUNDING, row + tile - 1 + half + ROUNDING))

@@ -35,7 +35,7 @@ def compiled_gain(
         jnp.zeros(0, jnp.int32) if scenes is None else _whole(scenes.ancestor),
         _real(noise.sigma),
         _real(noise.p_outlier),
-        _whole([window, drawn.everywhere, *((0, 0) if scenes is None else scenes.depth.shape[1:])]),
+        _whole([window, drawn.everywhere, *((0, 0) if scenes is None else scenes.depth.shape[1:]), image.own_rows]),
     )
     return _call(loops.GAIN, shape, inputs)
 
@@ -53,7 +53,7 @@ def compiled_depth(
         _real(image.ray_y),
         _real([*image.focal, *image.centre]),
         jnp.zeros(0) if start is None else _real(start),
-        _whole([*shape[1:], border, drawn.everywhere]),
+        _whole([*shape[1:], border, drawn.everywhere, image.own_rows]),
     )
     return _call(loops.DEPTH, shape, inputs)
 
@@ -93,5 +93,6 @@ def _reach(image: Image, noise: Noise, window: int) -> tuple[Float[Array, ""], F
     peak = 1 / (jnp.sqrt(2 * jnp.pi) * noise.sigma.min() * image.outlier_scale * least**2)
     odds = (1 - noise.p_outlier.min()) / jnp.maximum(noise.p_outlier.min(), 1e-12)
     nats = _NEGLIGIBLE + jnp.log1p(odds * peak)
-    sides = jnp.abs(image.ray_x).max() / image.focal[0] + jnp.abs(image.ray_y).max() / image.focal[1]
+    own = jnp.where(jnp.arange(len(image.ray_y)) < image.own_rows, image.ray_y, 0.0)
+    sides = jnp.abs(image.ray_x).max() / image.focal[0] + jnp.abs(own).max() / image.focal[1]
     return noise.sigma.max() * jnp.sqrt(2 * nats), window // 2 * sides

@@ -389,7 +389,8 @@ class Things(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """The observed image and the camera's numbers, as the kernel is given them."""
+    """The observed image and the camera's numbers, as the kernel is given them: of rows the camera's own, which are
+    the first, and of which `ray_y` tells the number."""
 
     depth: Float[np.ndarray, "H*W"]
     kind: Int[np.ndarray, "H*W"]
@@ -1071,7 +1072,7 @@ def _gain(frame):
     numbers, settings = floats(frame, 14), integers(frame, 19)
     window = settings[0]
     picture = Picture(
-        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13),
+        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13)[: settings[4]],
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
     _gains(
@@ -1094,7 +1095,7 @@ def _depth(frame):
     things, planes = _things(frame), floats(frame, 9)
     numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
-        start, things.kind, floats(frame, 10), floats(frame, 11),
+        start, things.kind, floats(frame, 10), floats(frame, 11)[: shape[4]],
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
     _depths(

@@ -52,7 +52,7 @@ class _Inputs(NamedTuple):
     kind: Any
     ray_x: Any
     ray_y: Any
-    numbers: Any  # focal 2, centre 2, outlier_scale, front_margin, weight
+    numbers: Any  # focal 2, centre 2, outlier_scale, front_margin, weight, the camera's rows
     sigma: Any
     p_outlier: Any
     scenes: Any
@@ -111,7 +111,7 @@ def triton_gain(
         scene=() if scenes is None else scenes.depth.shape[1:],
         compiled=not interpret,
     )
-    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight)
+    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight, image.own_rows)
     inputs = _Inputs(
         words=library.words,
         first=library.first,
@@ -148,15 +148,15 @@ def triton_gain(
 
 def _rectangles(drawn: Drawn, image: Image, library: LibraryArrays, half: int) -> Int[Array, "N 4"]:
     """First and one past the last column and row of the pixels whose windows a hypothesis may meet."""
-    height, width = image.depth.shape
+    (height, width), own_rows = image.depth.shape, image.own_rows
     tiles = tiles_of_objects(drawn.T_camera_object, drawn.type, image, library, half, drawn.everywhere, LARGE.tile)
     rows = -(-height // LARGE.tile)
     long, left, top = (a.reshape(-1, rows) for a in (jnp.diff(tiles.first), tiles.u, tiles.v))
     some = long > 0
-    u0, v0 = jnp.where(some, left, width).min(1), jnp.where(some, top, height).min(1)
+    u0, v0 = jnp.where(some, left, width).min(1), jnp.where(some, top, own_rows).min(1)
     u1 = jnp.where(some, left + LARGE.tile * long, 0).max(1)
     v1 = jnp.where(some, top + LARGE.tile, 0).max(1)
-    return jnp.stack([u0, v0, jnp.minimum(u1, width), jnp.minimum(v1, height)], 1)
+    return jnp.stack([u0, v0, jnp.minimum(u1, width), jnp.minimum(v1, own_rows)], 1)
 
 
 def _kernel(*refs: Any, shape: _Shape) -> None:
@@ -199,6 +199,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
     area = jnp.where((u1 > u0) & (v1 > v0), wide * tall, 0)
     count, block = _blocks(area, wide)
     fx, fy, cx, cy = (given.numbers[k] for k in range(4))
+    own_rows = given.numbers[7].astype(jnp.int32)
     normal = [given.plane[4 * n + k] for k in range(3)]
     offset = given.plane[4 * n + 3]
 
@@ -208,7 +209,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
     def draw(k: Array, _: None) -> None:
         index, row, column, real = block(k)
         u, v = u0 - half + column, v0 - half + row
-        inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < shape.height)
+        inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < own_rows)
         x, y = (u.astype(jnp.float32) - cx) / fx, (v.astype(jnp.float32) - cy) / fy
         depth = plane_depth(normal, offset, x, y)
         for which in range(shape.objects):
