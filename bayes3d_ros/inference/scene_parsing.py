@@ -16,17 +16,17 @@ from bayes3d_ros.inference import noise as noise_model
 from bayes3d_ros.inference import smc
 from bayes3d_ros.inference.coarse_to_fine import Context
 from bayes3d_ros.inference.noise import NoiseGrid
+from bayes3d_ros.inference.reconstruction import compile_drawing, draw_scene
 from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
-from bayes3d_ros.inference.table import find_plane, table_frame, workspace
-from bayes3d_ros.model.image import Image
+from bayes3d_ros.inference.table import find_plane, table_depth, table_frame, workspace
+from bayes3d_ros.model.image import Image, array_shape, scored_image
 from bayes3d_ros.model.library_arrays import library_arrays
-from bayes3d_ros.model.likelihood import BEYOND, Likelihood
+from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.observation import DepthFrame, reduced
+from bayes3d_ros.model.observation import DepthFrame, reduced, scored_size
 from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
-from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.model.scene_graph import Contact, Table
 from bayes3d_ros.model.summaries import summarise
 
@@ -50,6 +50,9 @@ class SceneParser:
     """Holds a library and compiled code; keeps no state between frames.
 
     The image is scored at `settings.score_width` pixels across; reconstruction and segmentation have the input's size.
+    What is compiled serves every size of image that is scored in arrays of one shape (`model/image.py: padded_height`):
+    with the default settings one shape for all images of at least 160 pixels across that are not taller than 4:3, and
+    another for taller ones up to 2:3.
     """
 
     def __init__(self, library: Library, settings: ParserSettings = ParserSettings()) -> None:
@@ -62,29 +65,31 @@ class SceneParser:
         self._draw_table_errors = jax.jit(draw_table_errors, static_argnames="count")
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._smooth_error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
-        self._cast = jax.jit(renderers["march"])
-        self._sizes: set[tuple[int, int]] = set()  # of images that have been parsed
+        self._compiled: set[tuple[int, ...]] = set()  # shapes of the arrays that images are scored in
 
     def compiled_for(self, width: int, height: int) -> bool:
-        """Whether an image of this size (pixels) can be parsed without compiling first."""
-        return (width, height) in self._sizes
+        """Whether parsing an image of this size needs no compilation, which takes tens of seconds. So it is after
+        `warm_up`, and after a frame of which two or more objects were found."""
+        return array_shape(width, height, self.settings.score_width) in self._compiled
 
     def warm_up(self, width: int, height: int) -> None:
-        """Compile for images of this size (values of the intrinsics do not matter) by parsing a made-up frame: a bare
-        table seen by a camera 0.8 m above it, which takes no search."""
-        intrinsics = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
+        """Compile for images of this size (values of the intrinsics do not matter) with a made-up image: a bare table
+        seen by a camera 0.8 m above it, which takes no search. Returns at once where that has been done."""
+        if self.compiled_for(width, height):
+            return
+        across, down = scored_size(width, height, self.settings.score_width)
+        camera = Intrinsics(float(across), float(across), (across - 1) / 2, (down - 1) / 2, across, down)
         above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
         T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
-        depth = above / np.maximum(intrinsics.rays()[..., 1] * c + s, 0.2)
-        frame = DepthFrame(depth.astype(np.float32), intrinsics, 0, "warm_up", T_table_camera)
-        with contextlib.suppress(ParseError):  # unusual settings may leave nothing of the frame
-            self.parse(frame)
-            image, table, *_ = self._observe(frame)
-            context, grid = self._context(image, table)
-            self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
-        self._sizes.add((width, height))
-        rays = jnp.zeros((height, width))
-        self._cast(self._arrays, jnp.int32(0), jnp.eye(4), (rays, rays))
+        depth = above / np.maximum(camera.rays()[..., 1] * c + s, 0.2)
+        kind = np.full(depth.shape, IN_WORKSPACE)
+        image, table = self._image(camera, depth, kind, np.linalg.inv(T_table_camera))
+        context, grid = self._context(image, table)
+        with contextlib.suppress(ParseError):  # a fixed number of objects is not found
+            self._sample(frame_key(0, 0), context, grid)
+        self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
+        compile_drawing(self._arrays)
+        self._compiled.add(array_shape(width, height, self.settings.score_width))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
         """The posterior given one frame. Raises ParseError with one clear line when there is none."""
@@ -93,7 +98,6 @@ class SceneParser:
         image, table, T_camera_table, notes = self._observe(frame)
         context, grid = self._context(image, table)
         stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, grid)
-        self._sizes.add((frame.intrinsics.width, frame.intrinsics.height))
         samples, log_evidence = self._mix(stages, table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
         reconstruction, segmentation = self._reconstruct(frame, T_camera_table, samples, summary)
@@ -128,27 +132,24 @@ class SceneParser:
         points = unproject(np.where(returned, depth, np.nan), camera)
         T_camera_table, notes = self._find_table(frame, points[returned])
         kind = workspace(points, T_camera_table, self._table_size, settings.workspace_height)
-        rays = camera.rays()
-        normal = T_camera_table[:3, 2]
-        facing = rays @ normal
-        with np.errstate(divide="ignore"):
-            bare = (normal @ T_camera_table[:3, 3]) / facing
-        bare = np.where((facing < -1e-3) & (bare > 0) & (bare < settings.far) & (kind != BEYOND), bare, np.inf)
-        image = Image(
-            depth=jnp.asarray(np.where(returned, depth, 0.0), jnp.float32),
-            kind=jnp.asarray(kind, jnp.int32),
-            ray_x=jnp.asarray(rays[0, :, 0]),
-            ray_y=jnp.asarray(rays[:, 0, 1]),
-            focal=jnp.array([camera.fx, camera.fy], jnp.float32),
-            centre=jnp.array([camera.cx, camera.cy], jnp.float32),
-            table=jnp.asarray(bare, jnp.float32),
-            outlier_scale=jnp.float32(3 / (settings.far**3 - settings.near**3)),
-            front_margin=jnp.float32(3 * settings.sigma_max),
-            likelihood=Likelihood(settings.likelihood),
-            weight=jnp.float32(settings.pixel_weight),
-        )
-        table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
+        image, table = self._image(camera, np.where(returned, depth, 0.0), kind, T_camera_table)
         return image, table, T_camera_table, notes
+
+    def _image(
+        self,
+        camera: Intrinsics,
+        depth: Float[np.ndarray, "height width"],
+        kind: Int[np.ndarray, "height width"],
+        T_camera_table: Float[np.ndarray, "4 4"],
+    ) -> tuple[Image, Table]:
+        """The image and the table in it for JAX, from depth in metres, 0 where there is no return."""
+        settings = self.settings
+        bare = np.where(kind != BEYOND, table_depth(camera.rays(), T_camera_table, settings.far), np.inf)
+        likelihood, weight = Likelihood(settings.likelihood), np.float32(settings.pixel_weight)
+        near, far, sigma_max = settings.near, settings.far, settings.sigma_max
+        image = scored_image(camera, depth, kind, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)
+        table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
+        return jax.device_put(image), table
 
     def _context(self, image: Image, table: Table) -> tuple[Context, NoiseGrid]:
         return Context(image, self._arrays, table), noise_model.for_image(self._grid, image, self.settings.window)
@@ -215,7 +216,11 @@ class SceneParser:
             return state
         key = jax.random.fold_in(key, 2000 + count)
         effort = Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating))
-        return smc.refresh(key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort)
+        state = smc.refresh(
+            key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort
+        )
+        self._compiled.add(context.image.depth.shape)  # the last of the slow ones
+        return state
 
     def _keep(
         self, key: PRNGKeyArray, state: smc.State, context: Context, grid: NoiseGrid, matters: bool = True
@@ -290,23 +295,11 @@ class SceneParser:
         return np.asarray(table.T_camera_table, np.float64) @ moved @ slide @ T_contact
 
     def _reconstruct(self, frame, T_camera_table, samples, summary):
-        """Depth and labels of the best scene at the input's size, drawn by the model's own renderer."""
-        camera = frame.intrinsics
-        rays = camera.rays()
-        normal = T_camera_table[:3, 2]
-        facing = rays @ normal
-        with np.errstate(divide="ignore"):
-            depth = np.where(facing < -1e-3, (normal @ T_camera_table[:3, 3]) / facing, np.inf)
-        depth = np.where((depth > 0) & (depth < self.settings.far), depth, np.inf).astype(np.float32)
-        labels = np.zeros(depth.shape, np.uint16)
-        for label, slot in enumerate(summary.slots, 1):
-            kind = samples.type[summary.reference, slot]
-            T = pose_matrix(samples.position[summary.reference, slot], samples.orientation[summary.reference, slot])
-            pair = (jnp.asarray(rays[..., 0]), jnp.asarray(rays[..., 1]))
-            drawn = np.asarray(self._cast(self._arrays, jnp.int32(kind), jnp.asarray(T, jnp.float32), pair))
-            nearer = drawn < depth
-            depth, labels = np.where(nearer, drawn, depth), np.where(nearer, np.uint16(label), labels)
-        return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels
+        """Depth and labels of the best scene at the input's size."""
+        kinds = [int(samples.type[summary.reference, slot]) for slot in summary.slots]
+        place, turn = samples.position[summary.reference], samples.orientation[summary.reference]
+        poses = [pose_matrix(place[slot], turn[slot]) for slot in summary.slots]
+        return draw_scene(kinds, poses, T_camera_table, frame.intrinsics, self.settings.far, self._arrays)
 
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:

@@ -144,6 +144,17 @@ def workspace(
     return np.where(stands | table, IN_WORKSPACE, np.where(other, BEYOND, NO_RETURN))
 
 
+def table_depth(
+    rays: Float[np.ndarray, "H W 3"], T_camera_table: Float[np.ndarray, "4 4"], far: float
+) -> Float[np.ndarray, "H W"]:
+    """Depth in metres at which rays (x, y, 1) meet the table's plane from above, inf where they do not before `far`."""
+    normal = T_camera_table[:3, 2]
+    facing = rays @ normal
+    with np.errstate(divide="ignore"):
+        depth = (normal @ T_camera_table[:3, 3]) / facing
+    return np.where((facing < -1e-3) & (depth > 0) & (depth < far), depth, np.inf)
+
+
 def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:
     """Pieces of an image connected without a jump in depth."""
     # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
