@@ -23,6 +23,15 @@ class CameraFollower:
         self.tracker, self.parser = tracker, parser
         self._told = None if world is None else tracker.start(world, np.eye(4))
 
+    def compiled_for(self, width: int, height: int, known: Tracking | None = None) -> bool:
+        """Whether the next frame needs no compilation, which takes tens of seconds, if it has this size and the camera
+        is not lost in it. How many objects a first frame shows is not known: any number that has been met counts. Where
+        the first frame is parsed, `parser.warm_up` does the larger part of it beforehand."""
+        world = known or self._told
+        objects = None if world is None else len(world.world.types)
+        parsed = world is not None or self.parser.compiled_for(width, height)
+        return parsed and self.tracker.compiled_for(width, height, objects)
+
     def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         """One frame, the first one where nothing is known yet. Where stamps jump, back (a bag that loops, a clock that
         was set back) or far ahead, the camera is found again. Raises TrackingError or ParseError, and then what was

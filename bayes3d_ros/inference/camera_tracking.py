@@ -21,7 +21,7 @@ from bayes3d_ros.inference.scene_parsing import frame_key
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.model.camera_score import World, render_cameras
-from bayes3d_ros.model.image import Image
+from bayes3d_ros.model.image import Image, array_shape, scored_image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.model.motions import exp_about, inverse, log_about, product, quaternions
@@ -56,7 +56,8 @@ class Tracking:
 class CameraTracker:
     """Holds a library and compiled code; what is known of a camera is handed in and out, frame by frame.
 
-    Compiled once for the images' size and the number of objects in the world. Hypotheses are shared out over all of
+    Compiled once for the number of objects in the world and the shape of the arrays that images are scored in, which is
+    the same for all images not taller than 4:3 (`model/image.py: padded_height`). Hypotheses are shared out over all of
     JAX's devices; `every_core` (`inference/compilation.py`) makes the cores of a CPU devices.
     """
 
@@ -69,6 +70,13 @@ class CameraTracker:
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._smooth = jax.jit(_smooth_covariance)
+        self._compiled: set[tuple[tuple[int, ...], int]] = set()  # shapes of these arrays, and numbers of objects
+
+    def compiled_for(self, width: int, height: int, objects: int | None = None) -> bool:
+        """Whether following a camera of this size of image needs no compilation in a world of so many objects (None:
+        of any number that has been met). Finding a camera that is lost may still need some."""
+        shape = array_shape(width, height, self.settings.score_width)
+        return any(shape == known and objects in (None, count) for known, count in self._compiled)
 
     def start(self, world: KnownWorld, T_world_camera: Float[np.ndarray, "4 4"]) -> Tracking:
         """A camera at rest at a pose that is roughly known. Raises WorldError for a world without objects, or with ones
@@ -139,6 +147,7 @@ class CameraTracker:
             sigma=float(info.sigma),
             seconds=time.perf_counter() - began,
         )
+        self._compiled.add((image.depth.shape, len(known.world.types)))
         now = replace(known, particles=particles, stamp_ns=frame.stamp_ns, frame_time=seconds)
         return now, replace(estimate, lost=self._why_lost(estimate))
 
@@ -195,24 +204,13 @@ class CameraTracker:
         if not returned.any():
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
-        rays = camera.rays()
         if T_camera_world is None:
             kind = np.where(returned, IN_WORKSPACE, NO_RETURN)
         else:
             kind = self._kinds(points, world, T_camera_world)
-        fields = {
-            "depth": np.where(returned, depth, 0.0).astype(np.float32),
-            "kind": kind.astype(np.int32),
-            "ray_x": rays[0, :, 0].astype(np.float32),
-            "ray_y": rays[:, 0, 1].astype(np.float32),
-            "focal": np.array([camera.fx, camera.fy], np.float32),
-            "centre": np.array([camera.cx, camera.cy], np.float32),
-            "table": np.full(depth.shape, np.inf, np.float32),
-            "outlier_scale": np.float32(3 / (settings.far**3 - settings.near**3)),
-            "front_margin": np.float32(3 * settings.sigma_max),
-            "weight": np.float32(1),
-        }
-        return Image(**on_all(fields, self._devices))
+        depth, nothing = np.where(returned, depth, 0.0), np.full(depth.shape, np.inf)
+        image = scored_image(camera, depth, kind, nothing, settings.near, settings.far, settings.sigma_max)
+        return on_all(image, self._devices)
 
     def _kinds(
         self, points: Float[np.ndarray, "H W 3"], world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]

@@ -118,6 +118,27 @@ def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
     assert np.abs(off(estimate, poses[9])[:3]).max() < 0.006
 
 
+def test_images_that_share_an_array_are_compiled_for_once(tracker, world, frame):
+    """After 32 x 24 pixels a camera of 32 x 18."""
+    there = looking(0.3)
+    told = CameraFollower(tracker, None, world)
+    known, _ = tracker.step(tracker.start(world, there), frame(0, there))
+    compiled = pose_filter.step._cache_size()
+    whole = frame(1, there)
+    camera = replace(CAMERA, cy=CAMERA.cy - 3, height=18)
+    _, estimate = tracker.step(known, replace(whole, depth=whole.depth[3:21], intrinsics=camera))
+    assert not estimate.lost and np.abs(off(estimate, there)[:3]).max() < 0.006
+    assert pose_filter.step._cache_size() == compiled
+    for size, is_compiled in (((32, 24), True), ((32, 18), True), ((640, 360), True), ((32, 32), False)):
+        assert tracker.compiled_for(*size) == tracker.compiled_for(*size, objects=1) == is_compiled
+        assert not tracker.compiled_for(*size, objects=2)
+        assert told.compiled_for(*size) == told.compiled_for(*size, known) == is_compiled
+    for parsed_already in (False, True):
+        parser = SimpleNamespace(compiled_for=lambda width, height, is_so=parsed_already: is_so)
+        follower = CameraFollower(tracker, parser)
+        assert follower.compiled_for(32, 24) == parsed_already and follower.compiled_for(32, 24, known)
+
+
 @pytest.mark.parametrize("gap", [2.0, 0.0, -0.1, -60.0])
 def test_after_a_jump_of_stamps_the_camera_is_looked_for(tracker, world, frame, gap):
     """Ahead by more than longest_gap, or back by anything: a bag that loops, a clock that is set back."""
