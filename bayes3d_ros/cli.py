@@ -142,8 +142,11 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
 
 
 def _frame_line(posterior: "ScenePosterior") -> str:
+    from bayes3d_ros.model.posterior import usable_note
+
     found = ", ".join(f"{o.type} {o.probability:.2f}" for o in posterior.objects) or "no object"
-    return f"{posterior.stamp_ns}  {posterior.seconds:.2f} s  {found}"
+    warning = f"  ({usable_note(posterior.usable_share)})" if posterior.too_little_usable else ""
+    return f"{posterior.stamp_ns}  {posterior.seconds:.2f} s  {found}{warning}"
 
 
 @main.command(name="import")

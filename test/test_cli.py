@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -86,6 +87,14 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
     ]
     assert [parser.warm for parser in parsers.made] == [[(64, 48)]]  # compiled once, before the first frame
     assert "3 frames parsed" in result.stdout and "block 0.86" in result.stdout
+
+
+def test_a_line_says_where_too_few_pixels_can_be_used(depth_frame, fake_posterior):
+    posterior = replace(fake_posterior(depth_frame(), ("block",), 0), objects=(), usable_share=0.153)
+    line = cli._frame_line(posterior)
+    assert "no object  (only 15% of the pixels on the table can be used" in line and "may be missed" in line
+    for share in (0.93, float("nan")):
+        assert cli._frame_line(replace(posterior, usable_share=share)).endswith("no object")
 
 
 def test_options_become_settings(bag, library, parsers, tmp_path):

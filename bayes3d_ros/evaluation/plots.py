@@ -1,6 +1,7 @@
 """Pictures of a parsed frame."""
 
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -204,9 +205,9 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
     counts = "   ".join(f"{n}: {p:.2f}" for n, p in posterior.num_objects.items() if p >= 0.005)
     lines = (
         f"p(number of objects)   {counts}",
+        *(line for note in posterior.notes[:2] for line in wrap(note, 74)),  # whole: they say what to make of p(n)
         f"depth noise σ {1e3 * posterior.sigma:.2f} mm    outliers {100 * posterior.p_outlier:.1f} %",
         f"log evidence over the empty table {posterior.log_evidence:.1f}    {posterior.seconds:.2f} s",
-        *(_shorten(note, 74) for note in posterior.notes[:2]),
     )
     axis.text(0.0, y - step - 0.02, "\n".join(lines), fontsize=9, color="#444444", va="top", linespacing=1.6)
 

@@ -37,6 +37,7 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "objects": [_object_record(found) for found in posterior.objects],
         "T_camera_table": json_numbers(posterior.T_camera_table),
         "ess": json_numbers(posterior.ess),
+        "usable_share": json_number(posterior.usable_share),
         "notes": list(posterior.notes),
     }
 

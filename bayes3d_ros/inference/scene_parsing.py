@@ -20,13 +20,13 @@ from bayes3d_ros.inference.reconstruction import compile_drawing, draw_scene
 from bayes3d_ros.inference.registration import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.inference.rejuvenation import Effort
 from bayes3d_ros.inference.settings import ParserSettings
-from bayes3d_ros.inference.table import find_plane, table_depth, table_frame, workspace
+from bayes3d_ros.inference.table import find_plane, table_depth, table_frame, usable_share, workspace
 from bayes3d_ros.model.image import Image, array_shape, scored_image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.model.objects import Library
 from bayes3d_ros.model.observation import DepthFrame, reduced, scored_size
-from bayes3d_ros.model.posterior import ParseError, ScenePosterior, SceneSamples
+from bayes3d_ros.model.posterior import FEWEST_USABLE, ParseError, ScenePosterior, SceneSamples, usable_note
 from bayes3d_ros.model.scene_graph import Contact, Table
 from bayes3d_ros.model.summaries import summarise
 
@@ -95,7 +95,7 @@ class SceneParser:
         """The posterior given one frame. Raises ParseError with one clear line when there is none."""
         start = time.perf_counter()
         settings = self.settings
-        image, table, T_camera_table, notes = self._observe(frame)
+        image, table, T_camera_table, usable, notes = self._observe(frame)
         context, grid = self._context(image, table)
         stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, grid)
         samples, log_evidence = self._mix(stages, table)
@@ -118,10 +118,12 @@ class SceneParser:
             ess=tuple(ess),
             seconds=time.perf_counter() - start,
             notes=tuple(notes),
+            usable_share=usable,
         )
 
-    def _observe(self, frame: DepthFrame) -> tuple[Image, Table, Float[np.ndarray, "4 4"], list[str]]:
-        """The image at scoring resolution, and the table in it."""
+    def _observe(self, frame: DepthFrame) -> tuple[Image, Table, Float[np.ndarray, "4 4"], float, list[str]]:
+        """The image at scoring resolution, the table in it and T_camera_table, which share of the pixels on the table
+        can be used, and notes."""
         settings = self.settings
         camera, depth, in_range, returned = reduced(frame, settings.score_width, settings.near, settings.far)
         if not in_range.any():
@@ -133,7 +135,9 @@ class SceneParser:
         T_camera_table, notes = self._find_table(frame, points[returned])
         kind = workspace(points, T_camera_table, self._table_size, settings.workspace_height)
         image, table = self._image(camera, np.where(returned, depth, 0.0), kind, T_camera_table)
-        return image, table, T_camera_table, notes
+        usable = usable_share(kind, camera.rays(), T_camera_table, self._table_size, settings.far)
+        notes = [usable_note(usable)] * (usable < FEWEST_USABLE) + notes
+        return image, table, T_camera_table, usable, notes
 
     def _image(
         self,

@@ -155,6 +155,23 @@ def table_depth(
     return np.where((facing < -1e-3) & (depth > 0) & (depth < far), depth, np.inf)
 
 
+def usable_share(
+    kind: Int[np.ndarray, "H W"],
+    rays: Float[np.ndarray, "H W 3"],
+    T_camera_table: Float[np.ndarray, "4 4"],
+    table_size: tuple[float, float],
+    far: float,
+) -> float:
+    """Of the pixels whose rays (x, y, 1) meet the table's prior area before `far` metres, the share whose return the
+    likelihood makes use of: as the table's, as that of what stands on it, or as evidence that nothing is in between.
+    NaN where no ray meets it."""
+    bare = table_depth(rays, T_camera_table, far)
+    met = np.isfinite(bare)
+    local = (rays[met] * bare[met, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
+    on_table = (np.abs(local) < np.array(table_size) / 2).all(-1)
+    return float((kind[met][on_table] != NO_RETURN).mean()) if on_table.any() else float("nan")
+
+
 def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:
     """Pieces of an image connected without a jump in depth."""
     # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.image import imread
 
 from bayes3d_ros.evaluation.plots import COLOURS, _view_from_above, colour, plot_scene
+from bayes3d_ros.model.posterior import usable_note
 
 TYPES = ("bowl", "can", "mug")
 
@@ -21,6 +23,18 @@ def test_a_picture_of_a_scene(tmp_path, depth_frame, fake_posterior, objects):
             frame.depth, fake_posterior(frame, TYPES, objects), tmp_path / "a.png", "title", frame.intrinsics
         )
     assert imread(path).shape == (820, 1500, 4)
+
+
+def test_a_warning_about_missing_pixels_stands_whole_in_the_picture(
+    tmp_path, depth_frame, fake_posterior, monkeypatch
+):
+    frame, note = depth_frame(), usable_note(0.15)
+    written = []
+    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: written.append(text))
+    posterior = replace(fake_posterior(frame, TYPES, 0), notes=(note, "made up"), usable_share=0.15)
+    plot_scene(frame.depth, posterior, tmp_path / "a.png")
+    (counts,) = [text for text in written if "p(number of objects)" in text]
+    assert note in counts.replace("\n", " ") and "made up" in counts
 
 
 def test_masks_have_the_colours_of_their_labels(tmp_path, depth_frame, fake_posterior):

@@ -12,7 +12,7 @@ from bayes3d_ros.model.summaries import posterior_rows
 TYPES = ("bowl", "can", "mug")
 KEYS = [
     "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects",
-    "T_camera_table", "ess", "notes",
+    "T_camera_table", "ess", "usable_share", "notes",
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",

@@ -16,6 +16,7 @@ from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model import image
 from bayes3d_ros.model.library_arrays import library_arrays
 from bayes3d_ros.model.objects import load_library
+from bayes3d_ros.model.posterior import FEWEST_USABLE
 from bayes3d_ros.model.rendering import renderers
 from bayes3d_ros.resources import share_directory
 
@@ -110,6 +111,18 @@ def test_rows_that_fill_up_an_array_change_no_result(parser, library, recorded, 
         np.testing.assert_allclose(one, other, atol=1e-4)
     np.testing.assert_allclose(filled_up.objects[0].position, alone.objects[0].position, atol=1e-5)
     np.testing.assert_array_equal(filled_up.segmentation, alone.segmentation)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+def test_too_few_usable_pixels_are_told(parser, recorded, missing):
+    lost = np.random.default_rng(0).random(recorded.depth.shape) < missing
+    posterior = parser.parse(replace(recorded, depth=np.where(lost, np.float32(np.nan), recorded.depth)))
+    if not missing:
+        assert posterior.usable_share > 0.9 and not posterior.too_little_usable and posterior.notes == ()
+        return
+    assert posterior.usable_share < FEWEST_USABLE and posterior.too_little_usable
+    (note,) = posterior.notes
+    assert note.startswith(f"only {posterior.usable_share:.0%} of the pixels on the table can be used")
 
 
 def placed(x, y, z):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
-from bayes3d_ros.inference.table import find_plane, table_frame, workspace
+from bayes3d_ros.inference.table import find_plane, table_depth, table_frame, usable_share, workspace
 from bayes3d_ros.model.likelihood import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.model.posterior import ParseError
 
@@ -84,3 +84,24 @@ def test_no_table_is_one_line(points, says):
     with pytest.raises(ParseError, match=says) as error:
         find_plane(points)
     assert "\n" not in str(error.value)
+
+
+def test_the_share_of_usable_pixels_is_of_those_that_look_at_the_table():
+    depth, up = scene(np.random.default_rng(3))
+    points = unproject(depth, CAMERA)[np.isfinite(depth)]
+    T, size, rays = table_frame(find_plane(points), points), (0.4, 0.3), CAMERA.rays()
+    bare = table_depth(rays, T, 5.0)
+    local = ((rays * bare[..., None])[np.isfinite(bare)] - T[:3, 3]) @ T[:3, :2]
+    np.testing.assert_allclose(bare[60:] * -(rays[60:] @ up), HEIGHT, atol=0.002)
+    on_table = np.zeros(depth.shape, bool)
+    on_table[np.isfinite(bare)] = (np.abs(local) < [0.2, 0.15]).all(-1)
+    assert 500 < on_table.sum() < 0.5 * depth.size
+    kind = np.where(on_table, IN_WORKSPACE, NO_RETURN)
+    assert usable_share(kind, rays, T, size, 5.0) == 1.0
+    row, column = np.nonzero(on_table)
+    kind[row[::4], column[::4]] = NO_RETURN
+    kind[row[1::4], column[1::4]] = BEYOND  # says that nothing is in between
+    assert usable_share(kind, rays, T, size, 5.0) == pytest.approx(0.75, abs=1e-3)
+    looks_up = np.diag([1.0, -1.0, -1.0, 1.0])  # the table above the camera, seen from below
+    looks_up[1, 3] = -1.0
+    assert np.isnan(usable_share(kind, rays, looks_up, size, 5.0))
