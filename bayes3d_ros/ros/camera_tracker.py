@@ -28,6 +28,7 @@ from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import TrackerSettings
 from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
+from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.model.world_file import load_world
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
@@ -49,6 +50,8 @@ _INPUT_PARAMETERS = tuple(f.name for f in fields(DepthInputSettings))
 
 class Follower(Protocol):
     """What the node needs of a tracker; see inference/camera_following.py."""
+
+    def compiled_for(self, width: int, height: int, known: Tracking | None) -> bool: ...
 
     def step(self, known: Tracking | None, frame, /) -> tuple[Tracking, CameraEstimate]: ...
 
@@ -157,7 +160,7 @@ class CameraTrackerNode(Node):
             return
         try:
             frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
-            with self._working():
+            with self._working(session.follower, frame):
                 known, estimate = session.follower.step(self._known, frame)
         except (ValueError, TrackingError, ParseError) as error:
             self._problem(f"lost: {error}" if self._known is not None else str(error))
@@ -175,11 +178,14 @@ class CameraTrackerNode(Node):
             self._trail.publish(PathMessage(header=self._path[-1].header, poses=list(self._path)))
         self._health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
 
-    def _working(self) -> contextlib.AbstractContextManager[None]:
+    def _working(self, follower: Follower, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
         """What the node does meanwhile, for diagnostics."""
-        if self._known is None:
-            return self._health.doing("compiling (a minute or two the first time) and looking at the first frame")
-        return self._health.doing("tracking one frame", usual=QUIET)
+        height, width = frame.depth.shape
+        what = "looking at the first frame" if self._known is None else "tracking one frame"
+        if follower.compiled_for(width, height, self._known):
+            return self._health.doing(what, usual=QUIET)
+        self.get_logger().info(f"compiling for images of {width}x{height}; a minute or two the first time")
+        return self._health.doing(f"compiling for images of {width}x{height} and {what}")
 
     def _worker_failed(self, error: Exception) -> None:
         self._problem(f"internal error, please report it: {one_line(error)}")

@@ -128,9 +128,9 @@ class Health:
         self._problem, self._problem_at = "", -math.inf
         self._doing: tuple[str, float, float] | None = None
         self._latency, self._seconds, self._ess = 0.0, 0.0, ""
-        self._notes: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
+        self._usable_share = math.nan
         self.parsed, self.refused, self.discarded = 0, 0, 0
-        self.usable_share = math.nan
         self.backend = ""
 
     def begin(self) -> None:
@@ -138,7 +138,7 @@ class Health:
         with self._lock:
             self._outputs.clear()
             self._began = time.monotonic()
-            self._problem, self._problem_at, self._notes = "", -math.inf, ()
+            self._problem, self._problem_at, self._warnings = "", -math.inf, ()
 
     def problem(self, text: str, kind: str = "") -> bool:
         """Note a frame that gave no output and why; True if that is worth a line in the log, where one line of a `kind`
@@ -153,13 +153,21 @@ class Health:
         with self._lock:
             self.discarded += 1
 
-    def output(self, seconds: float, ess: Sequence[float], latency: float, notes: Sequence[str] = ()) -> None:
+    def output(
+        self,
+        seconds: float,
+        ess: Sequence[float],
+        latency: float,
+        warnings: Sequence[str] = (),
+        usable_share: float = math.nan,
+    ) -> None:
         """Note an output: the seconds that inference took, effective shares of the particles, how many seconds after
-        its image it came, and what a user should be warned of."""
+        its image it came, what a user should be warned of, and the share of the pixels on the table that were used."""
         with self._lock:
             self.parsed += 1
             self._outputs.append(time.monotonic())
-            self._latency, self._seconds, self._notes = latency, seconds, tuple(notes)
+            self._latency, self._seconds, self._usable_share = latency, seconds, usable_share
+            self._warnings = tuple(warnings)
             self._ess = " ".join(f"{share:.2f}" for share in ess)
 
     @contextmanager
@@ -192,7 +200,7 @@ class Health:
     def warnings(self) -> list[str]:
         """What a user should be warned of in the last output."""
         with self._lock:
-            return list(self._notes)
+            return list(self._warnings)
 
     def report(
         self, name: str, level: bytes, message: str, *, state: str, received: int, dropped: int, view: InputView | None
@@ -212,11 +220,11 @@ class Health:
                 dropped=str(dropped),
                 waiting=str(received - self.parsed - self.refused - dropped),
                 camera_pose="" if view is None else view.pose_source,
-                usable_share="" if math.isnan(self.usable_share) else f"{self.usable_share:.2f}",
+                usable_share="" if math.isnan(self._usable_share) else f"{self._usable_share:.2f}",
                 backend=self.backend,
                 ess=self._ess,
                 last_problem=self._problem,
-                notes="" if view is None else "; ".join([*warnings(view), *notes(view), *self._notes]),
+                notes="" if view is None else "; ".join([*warnings(view), *notes(view), *self._warnings]),
             )
         return diagnostic_array(status)
 

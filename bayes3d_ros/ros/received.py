@@ -70,5 +70,6 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
         T_camera_table=np.full((4, 4), np.nan),
         ess=tuple(float(e) for e in values["ess"].split()),
         seconds=float(values["ms"]) / 1e3,
+        usable_share=float(values["usable share"]),
         notes=tuple(pair.value for pair in scene.values if pair.key == "note"),
     )

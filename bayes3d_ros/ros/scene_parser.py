@@ -20,7 +20,7 @@ from bayes3d_ros.inference.scene_parsing import SceneParser
 from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ParseError
+from bayes3d_ros.model.posterior import ParseError, usable_note
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, Health, InputView, judge, one_line
@@ -241,7 +241,9 @@ class SceneParserNode(Node):
             self._problem(str(error), messages.pose.problem if ready.parser.settings.table == "pose" else "")
             return
         self._outputs.scene(posterior, ready.parser.library, ready.markers)
-        self._health.output(posterior.seconds, posterior.ess, time.monotonic() - messages.arrived)
+        warnings = [usable_note(posterior.usable_share)] if posterior.too_little_usable else []
+        latency = time.monotonic() - messages.arrived
+        self._health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
 
     def _working(self, ready: Prepared, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
         """What the node does meanwhile, for diagnostics."""

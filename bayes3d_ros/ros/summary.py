@@ -23,6 +23,7 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
         sigma_mm=f"{posterior.sigma * 1e3:.3f}",
         ess=" ".join(f"{e:.2f}" for e in posterior.ess),
         ms=f"{posterior.seconds * 1e3:.0f}",
+        usable_share=f"{posterior.usable_share:.2f}",
     ) + [KeyValue(key="note", value=note) for note in posterior.notes]
     objects = [_object_status(k, o, posterior.frame_id) for k, o in enumerate(posterior.objects, start=1)]
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])

@@ -18,6 +18,9 @@ class FakeFollower:
     def __init__(self, library, settings, world):
         self.y = 0.0 if world is None else world.T_world_object[0, 1, 3]
 
+    def compiled_for(self, width, height, known):
+        return True
+
     def step(self, known, frame):
         depth = frame.depth[np.isfinite(frame.depth)]
         if not depth.size:

@@ -68,6 +68,7 @@ class FakeParser:
             T_camera_table=np.eye(4),
             ess=(1.0, 0.5),
             seconds=self.seconds,
+            usable_share=float(np.isfinite(frame.depth).mean()),
         )
 
 

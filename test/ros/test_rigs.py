@@ -192,6 +192,23 @@ def test_a_new_image_size_that_compiles_is_told(ros, library_folder: Path) -> No
     assert "compiling for images of 64x48" in process.output()
 
 
+def test_too_few_usable_pixels_are_a_warning_beside_the_output(ros, library_folder: Path) -> None:
+    diagnostics, poses = ros.listen(DiagnosticArray, "/diagnostics"), ros.listen(PoseArray, "/scene_parser/poses")
+    ros.start_parser(library_folder)
+    camera = ros.camera()
+    camera.wait_for_subscriber()
+    low = "parsing; only 31% of the pixels on the table can be used"
+    for share, level, text in ((0.3125, b"\x01", low), (1.0, b"\x00", "parsing")):
+        depth = DEPTH.copy()
+        depth[round(48 * share) :] = np.nan
+        stamp = round(share * 1e9)
+        camera.publish(replace(frame(stamp), depth=depth))
+        ros.wait_for(lambda s=stamp: poses and stamp_to_ns(poses[-1].header.stamp) == s, "the output")
+        report = ros.wait_for_diagnosis(diagnostics, text)
+        assert report.status[0].level == level
+        assert {v.key: v.value for v in report.status[0].values}["usable share"] == f"{share:.2f}"
+
+
 @pytest.mark.parametrize("busy", [False, True])
 def test_ctrl_c_ends_the_process_at_once(ros, library_folder: Path, busy: bool) -> None:
     """In 60 to 110 ms where nothing is being done; a frame that is being parsed is given 300 ms."""
