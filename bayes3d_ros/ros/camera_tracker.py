@@ -198,7 +198,9 @@ class CameraTrackerNode(Node):
     # Inputs and parameters
 
     def _open_inputs(self) -> None:
-        self._inputs = DepthInputs(self, self._worker.submit, self._node_settings())
+        # Only the first frame is placed by a pose; later ones need not wait for theirs.
+        settings = self._node_settings()
+        self._inputs = DepthInputs(self, self._worker.submit, settings, wants_pose=lambda: self._known is None)
 
     def _tick(self) -> None:
         if self._inputs is not None:

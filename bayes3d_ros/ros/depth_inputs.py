@@ -36,13 +36,19 @@ class DepthMessages(NamedTuple):
 class DepthInputs:
     """Calls `deliver` for images as they become complete; see input_queue.py and camera_pose_source.py.
 
-    `use_pose`: no, yes, or required: then an image waits for a pose even if nobody seems to send one.
+    `use_pose`: no, yes, or required: then an image waits for a pose even if nobody seems to send one. `wants_pose` is
+    asked for every image; without it none waits for a pose.
     """
 
     def __init__(
-        self, node: Node, deliver: Callable[[DepthMessages], None], settings: DepthInputSettings, use_pose: str = "yes"
+        self,
+        node: Node,
+        deliver: Callable[[DepthMessages], None],
+        settings: DepthInputSettings,
+        use_pose: str = "yes",
+        wants_pose: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._deliver = deliver
+        self._deliver, self._wants_pose = deliver, wants_pose
         self._queue: InputQueue[Image, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
         self.received, self.delivered = 0, 0
         self._delivered_at: float | None = None
@@ -131,7 +137,9 @@ class DepthInputs:
         self._take()
 
     def _find_pose(self, stamp_ns: int, image: Image, last: bool) -> CameraPose | None:
-        return NO_POSE if self._poses is None else self._poses.find(stamp_ns, image.header.frame_id, last)
+        if self._poses is None or not self._wants_pose():
+            return NO_POSE
+        return self._poses.find(stamp_ns, image.header.frame_id, last)
 
     def _pose_problem(self) -> str:
         if self._poses is None:

@@ -1,11 +1,12 @@
 """camera_tracker as a process of its own: poses in the world's frame at the image's stamp, silence while it is lost."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import Trigger
 
@@ -76,6 +77,20 @@ def test_a_lost_camera_has_no_pose_and_says_why(rig):
     rig.show(5 * 10**9, 1.0)
     rig.ros.wait_for(lambda: len(rig.poses) == 3, "a pose after the reset")
     rig.ros.wait_for(lambda: rig.paths[-1].poses and len(rig.paths[-1].poses) == 1, "a path that begins anew")
+
+
+def test_only_the_first_frame_waits_for_a_camera_pose(rig):
+    silent = rig.ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
+    rig.start(patience=1.0)
+    rig.ros.wait_for(silent.get_subscription_count, "a subscriber of the pose")
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "no message", TRACKER)
+    rig.ros.spin_until(time.monotonic() + 1.0)  # the node has looked who publishes
+    for k, slow in ((1, True), (2, False)):
+        rig.show(k * 10**9, 1.0)
+        rig.ros.wait_for(lambda k=k: len(rig.poses) == k, f"pose {k}")
+        report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
+        latency = {pair.key: pair.value for pair in report.status[0].values}["latency s"]
+        assert (float(latency) > 0.9) == slow
 
 
 def test_a_known_world_goes_to_the_tracker(rig, library_folder, tmp_path):
