@@ -1,7 +1,8 @@
 """The `bayes3d` command. Exit status: 0, 1 (failed), 2 (bad usage or input: one line on stderr)."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -9,16 +10,17 @@ import click
 
 import bayes3d_ros
 from bayes3d_ros.command_errors import InputError, OneLineErrors
+from bayes3d_ros.command_lines import camera_line, frame_line, note_lines, recording_line
+from bayes3d_ros.command_progress import progress, say, timed
 from bayes3d_ros.evaluation.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.bags import FrameReader
     from bayes3d_ros.inference.settings import ParserSettings
-    from bayes3d_ros.model.camera_estimate import CameraEstimate
     from bayes3d_ros.model.objects import Library
-    from bayes3d_ros.model.posterior import ScenePosterior
 
 Settings = TypeVar("Settings")
+_COMPILING = "compiling, about a minute the first time"
 FOLDER = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 ANY = click.Path(path_type=Path)
@@ -81,6 +83,7 @@ def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
     settings = _settings(ParserSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic)
+    click.echo(recording_line(frames))
     done, failed = _parse_frames(frames, models, settings, out)
     if failed and not done:
         raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
@@ -122,31 +125,27 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
     enable_cache()
     parser = SceneParser(library, settings)
     failed, size = 0, None
+    notes: tuple[str, ...] = ()
     with ResultsWriter(out, library.names) as results:
-        for frame in _progress(frames, len(frames), "frame"):
+        for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
             if size != (camera.width, camera.height):  # so that `seconds` are those of a running system
                 size = camera.width, camera.height
-                parser.warm_up(*size)
+                with timed(_COMPILING):
+                    parser.warm_up(*size)
             try:
                 posterior = parser.parse(frame)
             except ParseError as error:
                 failed += 1
-                _say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+                say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
                 continue
             picture = results.write(frame.depth, posterior)
             title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
             plot_scene(frame.depth, posterior, picture, title, camera)
-            _say(_frame_line(posterior))
+            for line in (frame_line(posterior), *note_lines(posterior, notes)):
+                say(line)
+            notes = posterior.notes
         return results.frames, failed
-
-
-def _frame_line(posterior: "ScenePosterior") -> str:
-    from bayes3d_ros.model.posterior import usable_note
-
-    found = ", ".join(f"{o.type} {o.probability:.2f}" for o in posterior.objects) or "no object"
-    warning = f"  ({usable_note(posterior.usable_share)})" if posterior.too_little_usable else ""
-    return f"{posterior.stamp_ns}  {posterior.seconds:.2f} s  {found}{warning}"
 
 
 @main.command(name="import")
@@ -167,7 +166,7 @@ def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: f
     from bayes3d_ros.model.objects import save_model
 
     models = make_models(meshes, library, voxel_size, scale=scale, replace=replace)
-    for made in list(_progress(models, len(meshes), "mesh")):
+    for made in list(progress(models, len(meshes), "mesh")):
         path = save_model(made.model, library, replace=replace)
         click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB")
         if made.warning:
@@ -207,7 +206,7 @@ def learn(
         refuse_existing(library, name)
     settings = _settings(LearnerSettings, more, options)
     reader = read_frames(bag, topic)
-    poses = [frame.T_table_camera for frame in _progress(reader, len(reader), "frame")]
+    poses = [frame.T_table_camera for frame in progress(reader, len(reader), "frame")]
     chosen = set(spread_views(poses, views))
     if not chosen:
         raise InputError(
@@ -257,25 +256,29 @@ def track(
     settings = _settings(TrackerSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic)
+    click.echo(recording_line(frames))
     enable_cache()
     every_core()
     told = None if world is None else load_world(world, settings.table, models)
     follower = CameraFollower(CameraTracker(models, settings), SceneParser(models), told)
+    around = "what its first frame shows" if told is None else ", ".join(told.types)
+    click.echo(f"following the camera around {around}")
     known: Tracking | None = None
     done: list[CameraEstimate] = []
     recorded, failed = [], 0
     with TrackWriter(out) as results:
-        for frame in _progress(frames, len(frames), "frame"):
+        for frame in progress(frames, len(frames), "frame"):
             try:
-                known, estimate = follower.step(known, frame)
+                with timed(f"first frame: {_COMPILING}") if known is None else nullcontext():
+                    known, estimate = follower.step(known, frame)
             except (TrackingError, ParseError) as error:
                 failed += 1
-                _say(f"{bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+                say(f"{bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
                 continue
             results.write(estimate)
             done.append(estimate)
             recorded.append(frame.T_table_camera)
-            _say(_camera_line(estimate))
+            say(camera_line(estimate))
     if not done:
         raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
     lost = sum(bool(estimate.lost) for estimate in done)
@@ -283,14 +286,6 @@ def track(
     summary += f", {failed} could not be" if failed else ""
     plot_track(done, out / PICTURE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
     click.echo(f"{summary}; results in {out}")
-
-
-def _camera_line(estimate: "CameraEstimate") -> str:
-    place = " ".join(f"{v:.4f}" for v in estimate.T_world_camera[:3, 3])
-    sure = 1e3 * estimate.covariance.diagonal()[:3].sum() ** 0.5
-    told = f"lost: {estimate.lost}" if estimate.lost else f"sd {sure:.1f} mm, {estimate.explained:.0%} explained"
-    again = ", searched for in the whole scene" if estimate.found_again else ""
-    return f"{estimate.stamp_ns}  {estimate.seconds:.2f} s  {place} m  {told}{again}"
 
 
 @main.command()
@@ -304,11 +299,11 @@ def simulate(scene: Path, out: Path) -> None:
 
     with tqdm(unit="frame", disable=None, leave=False) as bar:
 
-        def progress(done: int, total: int) -> None:
+        def advance(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        record(scene, out, progress)
+        record(scene, out, advance)
     click.echo(f"{out}")
 
 
@@ -349,10 +344,10 @@ def evaluate(experiment: str, quick: bool, out: Path) -> None:
     for note in notes:
         click.echo(note, err=True)
     click.echo(module.HEADER)
-    for rows in _progress(module.steps(quick), module.count(quick), "step"):
+    for rows in progress(module.steps(quick), module.count(quick), "step"):
         report["rows"] += rows
         for row in rows:
-            _say(module.line(row))
+            say(module.line(row))
         _write_json(file, report)  # after every step: an interrupted run leaves what it measured
     report["summary"] = module.summary(report["rows"])
     _write_json(file, report)
@@ -401,9 +396,9 @@ def bench(file: Path | None) -> None:
 
     def measure(section: Any) -> None:
         click.echo(section.HEADER)
-        for row in _progress(section.rows(), section.count(), "row"):
+        for row in progress(section.rows(), section.count(), "row"):
             report["rows"].append(row)
-            _say(section.line(row))
+            say(section.line(row))
             write()  # after every row: an interrupted run leaves what it measured
 
     def tell(name: str, values: dict[str, float]) -> None:
@@ -423,28 +418,13 @@ def bench(file: Path | None) -> None:
     try:
         from bayes3d_ros.ros import latency
     except ImportError as error:
-        _say(f"no row of a node: that needs ROS 2 ({error})", err=True)
+        say(f"no row of a node: that needs ROS 2 ({error})", err=True)
     else:
         try:
             measure(latency)
         except latency.LatencyError as error:
-            _say(f"no row of a node: {error}", err=True)
+            say(f"no row of a node: {error}", err=True)
     tell("growth", growth(report["rows"]))
-
-
-def _progress(items: Any, total: int, unit: str) -> "Iterator[Any]":
-    """With a bar on stderr where that is a terminal."""
-    from tqdm import tqdm
-
-    return iter(tqdm(items, total=total, unit=unit, disable=None, leave=False))
-
-
-def _say(text: str, err: bool = False) -> None:
-    """A line that leaves the progress bar whole."""
-    from tqdm import tqdm
-
-    with tqdm.external_write_mode():
-        click.echo(text, err=err)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,13 +14,14 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 
-from bayes3d_ros import cli
-from bayes3d_ros.bags import BagWriter
+from bayes3d_ros import cli, command_progress
+from bayes3d_ros.bags import BagWriter, read_frames
+from bayes3d_ros.command_lines import frame_line, note_lines, recording_line
 from bayes3d_ros.inference import camera_following, camera_tracking, scene_parsing
 from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
 from bayes3d_ros.model.mesh_import import model_from_mesh
 from bayes3d_ros.model.objects import load_library, save_model
-from bayes3d_ros.model.posterior import ParseError
+from bayes3d_ros.model.posterior import ParseError, usable_note
 from bayes3d_ros.resources import share_directory
 
 
@@ -86,15 +89,46 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
         f"{s}.{kind}" for s in (1, 2, 3) for kind in ("npz", "png")
     ]
     assert [parser.warm for parser in parsers.made] == [[(64, 48)]]  # compiled once, before the first frame
-    assert "3 frames parsed" in result.stdout and "block 0.86" in result.stdout
+    first, compiling, compiled, frame, note, *others, last = result.stdout.splitlines()
+    assert first == f"{bag}: 3 depth images of /depth/image_rect, CameraInfo of /depth/camera_info, no camera pose"
+    assert compiling == "compiling, about a minute the first time ..."
+    assert re.fullmatch(r"compiling, about a minute the first time: ready after \d+ s", compiled)
+    objects = "block p(exists) 0.86 p(type) 1.00, slab p(exists) 0.86 p(type) 1.00"
+    assert (frame, note) == (f"1  0.25 s  {objects}", "1  note: made up")
+    assert others == [f"{stamp}  0.25 s  {objects}" for stamp in (2, 3)]  # their note is the same
+    assert last == f"3 frames parsed; results in {out}" and not result.stderr
 
 
-def test_a_line_says_where_too_few_pixels_can_be_used(depth_frame, fake_posterior):
-    posterior = replace(fake_posterior(depth_frame(), ("block",), 0), objects=(), usable_share=0.153)
-    line = cli._frame_line(posterior)
-    assert "no object  (only 15% of the pixels on the table can be used" in line and "may be missed" in line
-    for share in (0.93, float("nan")):
-        assert cli._frame_line(replace(posterior, usable_share=share)).endswith("no object")
+def test_a_frame_without_objects_tells_how_sure_that_is(fake_posterior, depth_frame):
+    line = frame_line(fake_posterior(depth_frame(), ("block",), objects=0))
+    assert line == "1  0.25 s  no object p(n = 0) 1.00"
+
+
+def test_the_bag_line_names_the_camera_pose():
+    reader = read_frames(share_directory() / "bags" / "one_object")
+    assert recording_line(reader).endswith(
+        "one_object: 4 depth images of /depth/image_rect, CameraInfo of /depth/camera_info, camera pose of /camera_pose"
+    )
+
+
+def test_the_time_that_compiling_takes_is_counted_on_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(command_progress, "_TICK", 0.01)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with command_progress.timed("compiling"):
+        time.sleep(0.2)
+    told = capsys.readouterr()
+    assert told.out == "compiling: ready after 0 s\n" and "compiling ... 00:00" in told.err
+    with pytest.raises(ParseError), command_progress.timed("compiling"):
+        raise ParseError("no table")
+    assert not capsys.readouterr().out
+
+
+def test_that_too_few_pixels_can_be_used_is_said_of_every_frame(depth_frame, fake_posterior):
+    low = usable_note(0.153)
+    posterior = replace(fake_posterior(depth_frame(), ("block",), 0), usable_share=0.153, notes=(low, "made up"))
+    assert note_lines(posterior, ()) == [f"1  note: {low}", "1  note: made up"]
+    assert note_lines(posterior, posterior.notes) == [f"1  note: {low}"] and "15% of the pixels" in low
+    assert note_lines(replace(posterior, usable_share=float("nan")), posterior.notes) == []
 
 
 def test_options_become_settings(bag, library, parsers, tmp_path):
@@ -200,7 +234,7 @@ def test_a_mistake_of_the_program_is_one_line_too(bag, library, parsers, tmp_pat
     def broken(posterior):
         raise ZeroDivisionError("by nought")
 
-    monkeypatch.setattr(cli, "_frame_line", broken)
+    monkeypatch.setattr(cli, "frame_line", broken)
     result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
     assert_one_line(result, 1, "internal error", "ZeroDivisionError: by nought", "test_cli.py")
     assert (tmp_path / "out" / "samples.npz").exists()
@@ -239,7 +273,7 @@ def test_an_interrupt_is_one_line_and_keeps_what_was_finished(bag, library, pars
     def interrupted(posterior):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_frame_line", interrupted)
+    monkeypatch.setattr(cli, "frame_line", interrupted)
     result = run("parse", bag, "--library", library, "--out", tmp_path / "out")
     assert_one_line(result, 1, "interrupted")
     assert len((tmp_path / "out" / "scenes.jsonl").read_text().splitlines()) == 1
@@ -377,6 +411,11 @@ def test_track_writes_a_line_a_frame_and_a_picture(bag, library, followers, tmp_
     assert {"stamp_ns", "lost", "found_again", "seconds", *keys} == set(lines[0])
     assert lines[2]["position"] == pytest.approx([0.3, 0, 1]) and lines[0]["orientation"] == [0, 0, 0, 1]
     assert np.shape(lines[0]["covariance"]) == (6, 6)
+    first, around, beginning, ready, *_ = result.stdout.splitlines()
+    assert first == f"{bag}: 3 depth images of /depth/image_rect, CameraInfo of /depth/camera_info, no camera pose"
+    assert around == "following the camera around what its first frame shows"
+    assert beginning == "first frame: compiling, about a minute the first time ..."
+    assert ready.startswith("first frame: compiling, about a minute the first time: ready after ")
     assert "lost: out of sight" in result.stdout and "3 frames tracked, lost in 1" in result.stdout
     assert (out / "track.png").stat().st_size > 10_000
 
@@ -386,6 +425,7 @@ def test_track_around_a_known_world(bag, library, followers, tmp_path):
     file.write_text(f"objects: [{{type: {name}, position: [0.1, 0, 0], orientation: [0, 0, 0, 1]}}]")
     result = run("track", bag, "--library", library, "--out", tmp_path / "out", "--world", file)
     assert result.exit_code == 0, result.output
+    assert f"following the camera around {name}\n" in result.stdout
     assert followers.worlds[0].types == (name,) and followers.worlds[0].T_world_object[0, 0, 3] == 0.1
     file.write_text(file.read_text().replace(name, "nothing"))
     wrong = run("track", bag, "--library", library, "--out", tmp_path / "o", "--world", file)

@@ -22,7 +22,9 @@ TOP_LEVEL = {
     "bags": ("geometry", "model", "mcap_files"),
     "captures": ("geometry", "model"),
     "command_errors": ("geometry", "model", "inference", "evaluation", "mcap_files"),
-    "cli": (*LAYERS, "bags", "command_errors", "mcap_files", "resources"),
+    "command_lines": ("model", "bags"),
+    "command_progress": (),
+    "cli": (*LAYERS, "bags", "command_errors", "command_lines", "command_progress", "mcap_files", "resources"),
 }
 ROS_PACKAGES = {
     *("rclpy", "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "std_msgs", "std_srvs", "geometry_msgs"),
