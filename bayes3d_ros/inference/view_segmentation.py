@@ -17,6 +17,8 @@ _ENOUGH = 20_000  # points to find it by
 _LOWEST = 0.003, 0.010  # metres: the least and the largest height from which a return belongs to a thing
 _EDGE = 0.02  # share of the depth by which neighbours of a good pixel may differ
 _FEWEST = 60  # pixels that make a thing
+_SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises above it is a swell of the table
+_FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
 _STANDS = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
 _NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
 
@@ -66,11 +68,14 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
     spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
     lowest = float(np.clip(3 * spread, *_LOWEST))
     risen = inside & (local[..., 2] > lowest) & _undisturbed(depth)
-    labels = _things(local, risen, settings.gap)
-    sizes = np.bincount(labels[risen], minlength=1)
+    firm = _firm(risen, np.isfinite(depth))
+    labels = _things(local, risen, firm, settings.gap)
+    sizes = np.bincount(labels[firm], minlength=labels.max() + 1)
+    above_swells = np.bincount(labels[firm & (local[..., 2] > _SWELL * lowest)], minlength=len(sizes))
     foot = np.full(len(sizes), np.inf)
     np.minimum.at(foot, labels[risen], local[risen][:, 2])
-    found = [k for k in np.argsort(-sizes) if k > 0 and sizes[k] >= _FEWEST and foot[k] < _STANDS]
+    stands = (sizes >= _FEWEST) & (above_swells >= _FEWEST / 4) & (foot < _STANDS)
+    found = [k for k in np.argsort(-sizes) if k > 0 and stands[k]]
     if not found:
         raise ViewError(
             f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
@@ -176,16 +181,26 @@ def _undisturbed(depth: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         return np.isfinite(depth) & (high - low < _EDGE * depth) & (share > 0.75)
 
 
-def _things(local: Float[np.ndarray, "H W 3"], risen: Bool[np.ndarray, "H W"], gap: float) -> Int[np.ndarray, "H W"]:
-    """Labels 1.. of what is connected seen from above, over gaps narrower than `gap`; 0 elsewhere."""
+def _firm(risen: Bool[np.ndarray, "H W"], returned: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Risen pixels in the company of others. Of a large table thousands of returns lie beyond three standard deviations
+    of its noise, most where its smooth part is high: each alone, but often within `gap` of the next."""
+    count = ndimage.uniform_filter(returned.astype(np.float32), 3, mode="constant")
+    return risen & (ndimage.uniform_filter(risen.astype(np.float32), 3, mode="constant") > _FIRM * count)
+
+
+def _things(
+    local: Float[np.ndarray, "H W 3"], risen: Bool[np.ndarray, "H W"], firm: Bool[np.ndarray, "H W"], gap: float
+) -> Int[np.ndarray, "H W"]:
+    """Labels 1.. of what firm pixels connect seen from above, over gaps narrower than `gap`, for these and the risen
+    ones beside them; 0 elsewhere."""
     labels = np.zeros(risen.shape, int)
-    if not risen.any():
+    if not firm.any():
         return labels
     cell = gap / 4
     xy = local[risen][:, :2]
     index = ((xy - xy.min(0)) / cell).astype(int) + 3
     count = np.zeros(index.max(0) + 4, int)
-    np.add.at(count, tuple(index.T), 1)
+    np.add.at(count, tuple(index[firm[risen]].T), 1)
     disc = np.hypot(*np.mgrid[-2:3, -2:3]) <= 2
     pieces, _ = ndimage.label(ndimage.binary_dilation(count > 0, disc), np.ones((3, 3)))
     labels[risen] = pieces[tuple(index.T)]

@@ -7,12 +7,18 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from bayes3d_ros.bags import read_frames
 from bayes3d_ros.evaluation.capture_views import capture, shape_errors
-from bayes3d_ros.evaluation.random_scenes import resting_object
+from bayes3d_ros.evaluation.random_scenes import CAMERA, resting_object
+from bayes3d_ros.evaluation.ray_casting import Box, RayCaster
+from bayes3d_ros.evaluation.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.inference.object_learning import LearningError, learn, spread_views
 from bayes3d_ros.inference.settings import LearnerSettings
-from bayes3d_ros.inference.view_segmentation import ViewError, segment
+from bayes3d_ros.inference.view_segmentation import ViewError, middle, segment
 from bayes3d_ros.model.objects import load_model, save_model
+from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.resources import share_directory
 
 pytest.importorskip("mujoco")
 SETTINGS = LearnerSettings(voxel_size=0.005)
@@ -106,12 +112,12 @@ def test_a_view_with_another_thing_in_it(exact, learned):
     assert learn(frames[1:2], "bracket", replace(SETTINGS, cluster="largest")).model.box_size[2] > 0.1
 
 
-def with_box(frame, middle, side):
-    """The frame with a cube drawn into its depth: the nearest of its top and of what was seen."""
+def with_box(frame, middle, side, tall=None):
+    """The frame with a cube drawn into its depth, or a square box so tall: the nearest of its top and what was seen."""
     T = frame.T_table_camera
     rays = frame.intrinsics.rays() @ T[:3, :3].T
     depth = frame.depth.copy()
-    for height in np.linspace(0, side, 40):
+    for height in np.linspace(0, tall or side, 40):
         at = (height - T[2, 3]) / rays[..., 2]
         x, y = (at * rays[..., k] + T[k, 3] - middle[k] for k in range(2))
         inside = (np.abs(x) < side / 2) & (np.abs(y) < side / 2)
@@ -152,6 +158,42 @@ def test_a_view_that_says_nothing(exact, change, message):
         change = {"T_table_camera": pose}
     with pytest.raises(ViewError, match=message):
         segment(replace(frame, **change), SETTINGS)
+
+
+@pytest.mark.parametrize("bag", ["views_mug", "views_mustard_bottle", "views_power_drill", "views_cracker_box"])
+def test_every_bundled_view_shows_one_thing(bag):
+    """Two views of the mug from above showed three: specks of the table's noise, 3 to 4 mm high and 2 cm apart."""
+    frames = read_frames(share_directory() / "bags" / bag)
+    assert [len(segment(frame, SETTINGS).things) for frame in frames] == [1] * 8
+
+
+def empty_table(seed, noise):
+    """A bare table from above, with a camera's noise; its size is the image's."""
+    table, T_table_camera = np.eye(4), look_at(np.array([0.16, -0.2, 0.7]), np.zeros(3))
+    table[2, 3] = -0.015
+    clean = RayCaster([(Box((2.4, 1.8, 0.03)), table)]).render(T_table_camera, CAMERA)
+    rng = np.random.default_rng(seed)
+    depth = add_sensor_noise(clean.depth, clean.cosine, CAMERA, noise, draw_bias_field(noise, rng), rng)
+    return DepthFrame(depth.astype(np.float32), CAMERA, 1, "camera", T_table_camera)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [SensorNoise(), SensorNoise(range_sigma=0.003), SensorNoise(waviness=0.001)],
+    ids=["usual", "twice", "waves"],
+)
+def test_noise_of_a_bare_table_is_no_thing(noise):
+    for seed in range(3):
+        with pytest.raises(ViewError, match="nothing stands on the table"):
+            segment(empty_table(seed, noise), SETTINGS)
+
+
+@pytest.mark.parametrize("height", [0.006, 0.01])
+def test_a_flat_thing_is_one(height):
+    frame = empty_table(0, SensorNoise())
+    (thing,) = segment(with_box(frame, (0.05, 0.0), 0.06, height), SETTINGS).things
+    np.testing.assert_allclose(middle(thing.points), (0.05, 0.0), atol=0.004)
+    assert np.median(thing.points[:, 2]) == pytest.approx(height, abs=0.002)
 
 
 def test_an_empty_workspace(exact):
