@@ -12,6 +12,10 @@ from jaxtyping import Float
 
 from bayes3d_ros.geometry.camera import Intrinsics
 
+# A focal length, in sizes of the image (its longer side): fields of view of 169 and of half a degree.
+_SHORTEST, _LONGEST = 0.05, 100.0
+_FARTHEST_CENTRE = 10.0  # sizes of the image from its middle: images cut out of larger ones have it outside
+
 BytesLike = bytes | bytearray | memoryview | array.array | np.ndarray
 _PIXEL: dict[str, np.dtype] = {
     "16UC1": np.dtype(np.uint16),
@@ -84,7 +88,8 @@ def intrinsics_from_camera_info(
     """Intrinsics from the fields of a sensor_msgs/CameraInfo: from P where it is set (rectified images), else from K.
 
     k has 9 entries and p 12, row by row; width and height are CameraInfo's, `image_size` is (width, height) of the
-    image it goes with. Raises ValueError, one line that names the field, where they cannot be used or sizes disagree.
+    image it goes with. Raises ValueError, one line that names the field, where they cannot be used or sizes disagree,
+    or where no camera has such a focal length or principal point.
     """
     if len(k) != 9:
         raise ValueError(f"CameraInfo K: expected 9 values, got {len(k)}")
@@ -95,14 +100,21 @@ def intrinsics_from_camera_info(
             f"CameraInfo width, height: expected the image's {image_size[0]}x{image_size[1]}, got {width}x{height}"
         )
     if len(p) == 12 and p[0] != 0:
-        name, (fx, fy, cx, cy) = "P", (p[0], p[5], p[2], p[6])
+        name, values, at = "P", p, (0, 5, 2, 6)
     else:
-        name, (fx, fy, cx, cy) = "K", (k[0], k[4], k[2], k[5])
-    if name == "K" and k[0] == 0:
-        raise ValueError("CameraInfo K[0]: expected a focal length > 0, got 0, and P[0] is 0 as well")
-    try:
-        if not np.isfinite([cx, cy]).all():
-            raise ValueError(f"the principal point must be finite, got cx={cx} cy={cy}")
-        return Intrinsics(float(fx), float(fy), float(cx), float(cy), int(width), int(height))
-    except ValueError as error:
-        raise ValueError(f"CameraInfo {name}: {error}") from None
+        name, values, at = "K", k, (0, 4, 2, 5)
+        if k[0] == 0:
+            raise ValueError("CameraInfo K[0]: expected a focal length > 0, got 0, and P[0] is 0 as well")
+    if width < 1 or height < 1:
+        raise ValueError(f"CameraInfo width, height: expected a positive image size, got {width}x{height}")
+    size = max(width, height)
+    for i in at[:2]:
+        if not _SHORTEST * size <= values[i] <= _LONGEST * size:
+            expected = f"a focal length of {_SHORTEST * size:g} to {_LONGEST * size:g} pixels"
+            raise ValueError(f"CameraInfo {name}[{i}]: expected {expected} at {width}x{height}, got {values[i]:g}")
+    for i, side in zip(at[2:], (width, height), strict=True):
+        if not abs(values[i] - side / 2) <= _FARTHEST_CENTRE * size:
+            expected = f"a principal point within {_FARTHEST_CENTRE * size:g} pixels of the middle"
+            raise ValueError(f"CameraInfo {name}[{i}]: expected {expected} at {width}x{height}, got {values[i]:g}")
+    fx, fy, cx, cy = (float(values[i]) for i in at)
+    return Intrinsics(fx, fy, cx, cy, int(width), int(height))

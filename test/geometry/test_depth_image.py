@@ -100,12 +100,51 @@ def test_intrinsics_come_from_p_where_set_else_k():
         (K, [0.0] * 12, (320, 240), "CameraInfo width, height: expected the image's 320x240, got 640x480"),
         (K[:8], P, (640, 480), "CameraInfo K: expected 9 values, got 8"),
         (K, P[:9], (640, 480), "CameraInfo P: expected 12 values, got 9"),
-        ([-5.0] + K[1:], [0.0] * 12, (640, 480), "CameraInfo K: focal lengths must be positive"),
-        (K, [float("nan")] + P[1:], (640, 480), "CameraInfo P: focal lengths must be positive"),
-        (K[:2] + [float("inf")] + K[3:], [0.0] * 12, (640, 480), "CameraInfo K: the principal point must be finite"),
+        (
+            [-5.0] + K[1:],
+            [0.0] * 12,
+            (640, 480),
+            r"CameraInfo K\[0\]: expected a focal length of 32 to 64000 pixels at 640x480, got -5",
+        ),
+        (K, [float("nan")] + P[1:], (640, 480), r"CameraInfo P\[0\]: expected a focal length .* got nan"),
+        (
+            K[:2] + [float("inf")] + K[3:],
+            [0.0] * 12,
+            (640, 480),
+            r"CameraInfo K\[2\]: expected a principal point within 6400 pixels of the middle at 640x480, got inf",
+        ),
+        ([5e-324] + K[1:], [0.0] * 12, (640, 480), r"CameraInfo K\[0\]: expected a focal length .* got 4.94"),
+        (K, P[:5] + [1e9] + P[6:], (640, 480), r"CameraInfo P\[5\]: expected a focal length .* got 1e\+09"),
+        (K[:5] + [-1e5] + K[6:], [0.0] * 12, (640, 480), r"CameraInfo K\[5\]: expected a principal point .* got -1"),
     ],
 )
 def test_misfits_of_camera_info(k, p, size, line):
     with pytest.raises(ValueError, match=line) as error:
         intrinsics_from_camera_info(k, p, 640, 480, size)
     assert "\n" not in str(error.value)
+
+
+def test_nothing_but_cameras_becomes_intrinsics():
+    """10,000 random messages: a ValueError of one line, or rays that are finite."""
+    rng = np.random.default_rng(0)
+    nasty = [0.0, -0.0, 5e-324, 1e-310, 1e-30, 1e-3, 1.0, 30.0, 300.0, 600.0, 6e4, 1e30, 1e308, -1.0, -600.0]
+    nasty += [np.nan, np.inf, -np.inf]
+    sizes = [0, 1, 2, 7, 64, 640, 2**31, 2**32 - 1]
+    accepted = 0
+    for _ in range(10_000):
+        k, p = (rng.choice(nasty, n) for n in (9, 12))
+        if rng.random() < 0.5:
+            p[0] = 0.0
+        if rng.random() < 0.5:  # only one value is wrong
+            k, p = np.array(K), np.array(P)
+            (k if rng.random() < 0.5 else p)[rng.integers(9)] = rng.choice(nasty)
+        width, height = (int(n) for n in rng.choice(sizes, 2))
+        try:
+            camera = intrinsics_from_camera_info(k, p, width, height, (width, height))
+        except ValueError as error:
+            assert str(error).startswith("CameraInfo ") and "\n" not in str(error)
+            continue
+        accepted += 1
+        small = camera if width * height < 10**6 else camera.resized(8, 8)
+        assert np.isfinite(small.rays()).all() and small.fx > 0 and small.fy > 0
+    assert accepted > 300
