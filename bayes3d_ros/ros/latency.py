@@ -4,6 +4,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import rclpy
@@ -62,17 +63,26 @@ def node_row(case: Case, library: Path, logs: Path, rate: float = RATE) -> Speed
         if isinstance(message, PoseArray):
             most_objects = max(most_objects, len(message.poses))
 
-    try:
+    with ExitStack() as ending:  # the last in is the first to end
+        ending.callback(shut_down, context)
         node = Node("latency", context=context)
+        ending.callback(node.destroy_node)
         node.create_subscription(Image, reader.depth_topic, lambda m: keep("image", m), 10)
         node.create_subscription(PoseArray, "/scene_parser/poses", lambda m: keep("poses", m), 10)
         executor = SingleThreadedExecutor(context=context)
+        # Else Python destroys it at some later time together with its guard conditions, in any order, and where they go
+        # first its __del__ raises InvalidHandle.
+        ending.callback(executor.shutdown)
         executor.add_node(node)
+
+        def start(log: str, *command: str) -> None:
+            processes.append(NodeProcess(["-m", *command], domain, logs / log))
+            ending.callback(processes[-1].stop)
+
         size = ("-p", f"warm_up_width:={camera.width}", "-p", f"warm_up_height:={camera.height}")
-        parser = ["-m", "bayes3d_ros.ros.scene_parser", "--ros-args", "-p", f"library:={library}", *size]
-        processes.append(NodeProcess(parser, domain, logs / "scene_parser.log"))
-        player = ["-m", "bayes3d_ros.ros.bag_player", str(case.bag), "--rate", str(rate), "--wait", str(START_SECONDS)]
-        processes.append(NodeProcess(player, domain, logs / "bag_player.log"))
+        start("scene_parser.log", "bayes3d_ros.ros.scene_parser", "--ros-args", "-p", f"library:={library}", *size)
+        slowly = ("--rate", str(rate), "--wait", str(START_SECONDS))
+        start("bag_player.log", "bayes3d_ros.ros.bag_player", str(case.bag), *slowly)
         deadline = time.monotonic() + START_SECONDS
         while not came["poses"].keys() >= set(stamps):
             executor.spin_once(timeout_sec=0.1)
@@ -80,9 +90,5 @@ def node_row(case: Case, library: Path, logs: Path, rate: float = RATE) -> Speed
                 if process.status not in (None, 0) or time.monotonic() > deadline:
                     last = (process.output().strip().splitlines() or ["it said nothing"])[-1]
                     raise LatencyError(f"{len(came['poses'])} of {len(stamps)} frames of {case.bag} came back: {last}")
-    finally:
-        for process in processes:
-            process.stop()
-        shut_down(context)
     seconds = [came["poses"][stamp] - came["image"][stamp] for stamp in stamps if stamp in came["image"]]
     return parsing_row("node", case, f"{camera.width}x{camera.height}", seconds, most_objects)
