@@ -167,8 +167,9 @@ def import_(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: f
 
     models = make_models(meshes, library, voxel_size, scale=scale, replace=replace)
     for made in list(progress(models, len(meshes), "mesh")):
-        path = save_model(made.model, library, replace=replace)
-        click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB")
+        path = save_model(made.model, library, replace=replace or made.replaces)
+        again = f", replaces an earlier import of {made.mesh.name}" if made.replaces else ""
+        click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB{again}")
         if made.warning:
             click.echo(f"{made.mesh}: {made.warning}", err=True)
 

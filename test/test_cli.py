@@ -299,10 +299,15 @@ def test_import_refuses_models_that_exist_and_meshes_in_millimetres(tmp_path):
     assert run("import", box, *options, "--scale", "0.001").exit_code == 0
     (model,) = load_library(library).models
     assert sorted(model.box_size) == pytest.approx([0.03, 0.04, 0.05])
-    assert_one_line(run("import", box, *options, "--scale", "0.002"), 2, library / "brick.npz", "--replace")
-    assert run("import", box, *options, "--scale", "0.002", "--replace").exit_code == 0
+    again = run("import", box, *options, "--scale", "0.002")
+    assert again.exit_code == 0 and "replaces an earlier import of brick.stl" in again.stdout
     assert max(load_library(library).models[0].box_size) == pytest.approx(0.1)
     assert_one_line(run("import", box, *options, "--scale", "nan"), 2, "scale")
+    save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "brick", 0.01), library, replace=True)
+    before = (library / "brick.npz").read_bytes()
+    assert_one_line(run("import", box, *options, "--scale", "0.002"), 2, library / "brick.npz", "--replace")
+    assert (library / "brick.npz").read_bytes() == before
+    assert run("import", box, *options, "--scale", "0.002", "--replace").exit_code == 0
 
 
 def test_help_does_not_load_what_is_heavy():

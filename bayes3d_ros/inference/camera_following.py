@@ -60,6 +60,8 @@ class CameraFollower:
 
     def _first(self, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         if self._told is None:
+            height, width = frame.depth.shape
+            self.parser.warm_up(width, height)  # or frames that show nothing would leave part of it to a later one
             world, T_world_camera = world_of(self.parser.parse(frame), self.tracker.settings.table)
             now, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
             return now, replace(estimate, found_again=True)

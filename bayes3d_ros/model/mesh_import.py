@@ -18,7 +18,15 @@ from bayes3d_ros.geometry.mesh import (
     size_warning,
 )
 from bayes3d_ros.geometry.voxels import voxelize
-from bayes3d_ros.model.objects import NAME_PATTERN, ObjectModel, refuse_existing, save_model
+from bayes3d_ros.model.objects import (
+    NAME_PATTERN,
+    LibraryError,
+    ObjectModel,
+    load_model,
+    model_path,
+    refuse_existing,
+    save_model,
+)
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
@@ -31,6 +39,7 @@ class MeshModel(NamedTuple):
     mesh: Path
     model: ObjectModel
     warning: str | None  # one line, or None
+    replaces: bool  # an earlier import of a mesh file of this name
 
 
 class ImportedMesh(NamedTuple):
@@ -54,7 +63,7 @@ def import_meshes(
     All models are made before the first is written: a mesh that cannot be used leaves the library as it was.
     """
     made = list(make_models(paths, folder, voxel_size, scale=scale, replace=replace))
-    return [ImportedMesh(m.mesh, save_model(m.model, folder, replace=replace), m.warning) for m in made]
+    return [ImportedMesh(m.mesh, save_model(m.model, folder, replace=replace or m.replaces), m.warning) for m in made]
 
 
 def make_models(
@@ -69,7 +78,8 @@ def make_models(
     meshes is in metres.
 
     Raises, before any work, MeshError where a name cannot be used, and LibraryError where models of these names exist
-    and are not to be replaced; later MeshError for a mesh that cannot be used. Each is one line naming the files.
+    and are not to be replaced, save for those that were imported from mesh files of the same names; later MeshError for
+    a mesh that cannot be used. Each is one line naming the files.
     """
     if not 0 < scale < np.inf:
         raise MeshError(f"scale: expected a positive number of metres, got {scale}")
@@ -83,18 +93,28 @@ def make_models(
         if not path.is_file():
             raise MeshError(f"{path}: no such mesh file")
         stems[path.stem] = path
+    earlier = {stem for stem, path in stems.items() if _was_imported(path, folder)}
     if not replace:
-        refuse_existing(folder, *stems)
+        refuse_existing(folder, *(stem for stem in stems if stem not in earlier))
     for path in paths:
         mesh = load_mesh(path)
         try:
-            yield _made(path, mesh.apply_scale(scale), voxel_size)
+            yield _made(path, mesh.apply_scale(scale), voxel_size, path.stem in earlier)
         except MeshError as error:
             given = "" if scale == 1 else f"at --scale {scale:g} "
             raise MeshError(f"{path}: {given}{error}") from error
 
 
-def _made(path: Path, mesh: trimesh.Trimesh, voxel_size: float) -> MeshModel:
+def _was_imported(path: Path, folder: Path) -> bool:
+    """Whether the library holds a model that was imported from a mesh file of this name."""
+    try:
+        about = load_model(model_path(folder, path.stem)).provenance
+    except LibraryError:
+        return False
+    return about.get("kind") == "mesh" and about.get("source") == path.name
+
+
+def _made(path: Path, mesh: trimesh.Trimesh, voxel_size: float, replaces: bool) -> MeshModel:
     problem = size_problem(mesh)
     if problem:
         raise MeshError(problem)
@@ -102,7 +122,7 @@ def _made(path: Path, mesh: trimesh.Trimesh, voxel_size: float) -> MeshModel:
     warning = size_warning(mesh)
     if model.box_size.max() < 2 * voxel_size:
         warning = f"the mesh is only {model.box_size.max():.2g} m long, less than two voxels of {voxel_size} m"
-    return MeshModel(path, model, warning)
+    return MeshModel(path, model, warning, replaces)
 
 
 def model_from_mesh(

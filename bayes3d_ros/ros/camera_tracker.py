@@ -31,6 +31,7 @@ from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError
 from bayes3d_ros.model.world_file import load_world
+from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, Health, InputView, judge, one_line
@@ -46,6 +47,8 @@ from bayes3d_ros.ros.worker import NewestWorker
 _RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 _TRACKER_PARAMETERS = ("library", "world", *(f.name for f in fields(TrackerSettings)))
 _INPUT_PARAMETERS = tuple(f.name for f in fields(DepthInputSettings))
+
+_PURPOSE = "Depth images in, where the camera is in the world that it first saw out."
 
 
 class Follower(Protocol):
@@ -249,6 +252,7 @@ class CameraTrackerNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    check_arguments("camera_tracker", _PURPOSE, args)
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
     with contextlib.suppress(OSError):  # a home that cannot be written to costs a compilation, not the node
         enable_cache()

@@ -124,6 +124,8 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
     posterior = posterior_from_messages(messages, library)
     for line in scene_table(posterior, errors(posterior, library, truth(bag, frame))):
         say(line)
+    for note in posterior.notes:
+        say(f"note: {note}")
     picture = plot_scene(frame.depth, posterior, out / "scene.png", f"{bag.name}, as published", frame.intrinsics)
     say(f"every output arrived; picture: {picture}")
 

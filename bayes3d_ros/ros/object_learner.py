@@ -31,6 +31,7 @@ from bayes3d_ros.inference.settings import LearnerSettings
 from bayes3d_ros.inference.view_segmentation import Thing, ViewError, segment
 from bayes3d_ros.model.objects import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import (
@@ -59,6 +60,8 @@ _INPUTS = tuple(f.name for f in fields(DepthInputSettings))
 
 
 _Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+
+_PURPOSE = "Captures views of an unknown object and builds a model of it that scene_parser can use."
 
 
 class Refusal(Exception):
@@ -315,6 +318,7 @@ class ObjectLearnerNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    check_arguments("object_learner", _PURPOSE, args)
     return run(ObjectLearnerNode, args)
 
 

@@ -21,6 +21,7 @@ from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.model.objects import Library, LibraryError, load_library
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.model.posterior import ParseError, usable_note
+from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, Health, InputView, judge, one_line
@@ -37,6 +38,8 @@ from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
 
 _PARSER_PARAMETERS = tuple(f.name for f in fields(ParserSettings))
+
+_PURPOSE = "Depth images in, posteriors over 3D tabletop scenes out: which objects stand where, and how sure that is."
 
 
 class SceneParserNode(Node):
@@ -235,7 +238,8 @@ class SceneParserNode(Node):
             return
         try:
             frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
-            with self._working(ready, frame):
+            self._compile_for(frame, ready)
+            with self._health.doing("parsing one frame", usual=QUIET):
                 posterior = ready.parser.parse(frame)
         except (ValueError, ParseError) as error:
             self._problem(str(error), messages.pose.problem if ready.parser.settings.table == "pose" else "")
@@ -245,13 +249,13 @@ class SceneParserNode(Node):
         latency = time.monotonic() - messages.arrived
         self._health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
 
-    def _working(self, ready: Prepared, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
-        """What the node does meanwhile, for diagnostics."""
+    def _compile_for(self, frame: DepthFrame, ready: Prepared) -> None:
+        """Compile for images of a frame's size, where that is needed, and say so."""
         height, width = frame.depth.shape
-        if ready.parser.compiled_for(width, height):
-            return self._health.doing("parsing one frame", usual=QUIET)
-        self.get_logger().info(f"compiling for images of {width}x{height}")
-        return self._health.doing(f"compiling for images of {width}x{height}")
+        if not ready.parser.compiled_for(width, height):
+            self.get_logger().info(f"compiling for images of {width}x{height}; a minute or so the first time")
+            with self._health.doing(f"compiling for images of {width}x{height}"):
+                ready.parser.warm_up(width, height)
 
     def _worker_failed(self, error: Exception) -> None:
         self._problem(f"internal error, please report it: {one_line(error)}")
@@ -303,6 +307,7 @@ class SceneParserNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    check_arguments("scene_parser", _PURPOSE, args)
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
     with contextlib.suppress(OSError):  # a home that cannot be written to costs a compilation, not the node
         enable_cache()

@@ -89,6 +89,11 @@ def parsed(world, T_world_camera, frame):
     return SimpleNamespace(objects=objects, T_camera_table=T)
 
 
+def parser_that(parse):
+    """A parser that has nothing to compile."""
+    return SimpleNamespace(parse=parse, warm_up=lambda width, height: None)
+
+
 def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
     calls = []
 
@@ -97,7 +102,7 @@ def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
         return parsed(world, poses[round((seen.stamp_ns - 10**9) / STEP)], seen)
 
     poses = [looking(0.3 + 0.02 * k) for k in range(9)] + [looking(2.2)]
-    follower = CameraFollower(tracker, SimpleNamespace(parse=parse))
+    follower = CameraFollower(tracker, parser_that(parse))
     known, estimate = follower.step(None, frame(0, poses[0]))
     assert estimate.found_again and calls == [10**9] and known.world.types == ("thing",)
     compiled, distances = pose_filter.step._cache_size(), []
@@ -143,7 +148,7 @@ def test_images_that_share_an_array_are_compiled_for_once(tracker, world, frame)
 def test_after_a_jump_of_stamps_the_camera_is_looked_for(tracker, world, frame, gap):
     """Ahead by more than longest_gap, or back by anything: a bag that loops, a clock that is set back."""
     there = looking(-0.8)
-    follower = CameraFollower(tracker, SimpleNamespace(parse=lambda seen: parsed(world, there, seen)))
+    follower = CameraFollower(tracker, parser_that(lambda seen: parsed(world, there, seen)))
     known = replace(tracker.start(world, looking(0.3)), stamp_ns=10**9 - round(gap * 10**9))
     known, estimate = follower.step(known, frame(0, there))
     assert estimate.found_again and not estimate.lost
@@ -185,12 +190,12 @@ def test_a_lost_camera_is_looked_for_where_parsing_does_not_help(tracker, world,
         return nothing if told == "nothing" else parsed(world, looking(0.4, 1.4), seen)
 
     here, there = looking(0.4), looking(3.6)
-    follower = CameraFollower(tracker, SimpleNamespace(parse=parse), world)
+    follower = CameraFollower(tracker, parser_that(parse), world)
     known, _ = follower.step(None, replace(frame(0, here), T_table_camera=here))
     known, estimate = follower.step(known, frame(1, there))
     assert estimate.found_again and not estimate.lost
     assert np.abs(off(estimate, there)[:3]).max() < 0.006
-    alone = CameraFollower(tracker, SimpleNamespace(parse=parse))  # the world is what a frame showed
+    alone = CameraFollower(tracker, parser_that(parse))  # the world is what a frame showed
     if told == "nothing":
         with pytest.raises(TrackingError, match="found no object"):
             alone.step(known, frame(100, there))

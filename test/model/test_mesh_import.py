@@ -167,7 +167,8 @@ def test_one_bad_mesh_of_several_leaves_the_library_as_it_was(tmp_path, broken):
 
 def test_all_models_that_exist_are_named_before_any_mesh_is_read(tmp_path):
     paths, folder = [write_box(tmp_path / f"{name}.stl") for name in "abc"], tmp_path / "library"
-    import_meshes(paths[:2], folder, 0.01)
+    for name in "ab":
+        save_model(model_from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), name, 0.01), folder)
     before = {path: path.read_bytes() for path in folder.iterdir()}
     paths[0].write_text("broken")
     with pytest.raises(LibraryError) as error:
@@ -176,6 +177,8 @@ def test_all_models_that_exist_are_named_before_any_mesh_is_read(tmp_path):
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     import_meshes(paths[1:], folder, 0.005, replace=True)
     assert load_model(folder / "b.npz").voxel_size == 0.005 and load_library(folder).names == ("a", "b", "c")
+    import_meshes(paths[1:], folder, 0.008)  # the same meshes again
+    assert load_model(folder / "b.npz").voxel_size == 0.008
 
 
 def test_millimetres_are_refused_and_scaled(tmp_path):

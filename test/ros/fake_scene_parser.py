@@ -25,15 +25,15 @@ class FakeParser:
         self._sizes: set[tuple[int, int]] = set()
 
     def warm_up(self, width: int, height: int) -> None:
+        if not self.compiled_for(width, height):
+            threading.Event().wait(self.compiling)
         self._sizes.add((width, height))
 
     def compiled_for(self, width: int, height: int) -> bool:
         return not self.compiling or (width, height) in self._sizes
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
-        height, width = frame.depth.shape
-        threading.Event().wait(self.seconds + (0.0 if self.compiled_for(width, height) else self.compiling))
-        self.warm_up(width, height)
+        threading.Event().wait(self.seconds)
         if not np.isfinite(frame.depth).any():
             raise ParseError("depth image: no pixel has a return")
         if self.settings.table == "pose" and frame.T_table_camera is None:

@@ -7,15 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.bags import read_frames
-from bayes3d_ros.model.objects import load_library
+from bayes3d_ros.model.mesh_import import model_from_mesh
+from bayes3d_ros.model.objects import load_library, save_model
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import conversions
@@ -61,6 +65,11 @@ class Rig:
             return ("newest stamp", f"{frame.stamp_ns}{posed}") in pairs
 
         self.ros.wait_for(arrived, "the image to be received")
+
+    def set_parameter(self, name: str, value: object) -> None:
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        (result,) = self.ros.call(SetParameters, "/object_learner/set_parameters", request).results
+        assert result.successful, result.reason
 
     def call(self, service: str) -> Trigger.Response:
         return self.ros.call(Trigger, f"/object_learner/{service}", Trigger.Request())
@@ -111,6 +120,14 @@ def test_a_model_is_learned_across_kills(ros, rig: Rig, frames) -> None:
     assert models[0].header.frame_id == "table"
     assert conversions.stamp_to_ns(models[0].header.stamp) == frames[4].stamp_ns
     assert len(rows) == len(model.surface_index) and rows["z"].max() == pytest.approx(0.19, abs=0.01)
+    assert rig.call("build").success  # all of the model's views are among the captures
+    save_model(model_from_mesh(trimesh.creation.box((0.06, 0.1, 0.2)), "thing", 0.01), rig.library, replace=True)
+    refused = rig.call("build")
+    assert not refused.success and "thing.npz: a model of this name exists already" in refused.message
+    assert load_library(rig.library).models[0].provenance["kind"] == "mesh"
+    rig.set_parameter("replace", True)
+    assert rig.call("build").success
+    assert load_library(rig.library).models[0].provenance["kind"] == "views"
     answer = rig.call("reset")
     assert answer.success and answer.message == "3 captures of thing deleted"
     assert not rig.call("build").success
