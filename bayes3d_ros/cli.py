@@ -124,15 +124,14 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
 
     enable_cache()
     parser = SceneParser(library, settings)
-    failed, size = 0, None
+    failed = 0
     notes: tuple[str, ...] = ()
     with ResultsWriter(out, library.names) as results:
         for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
-            if size != (camera.width, camera.height):  # so that `seconds` are those of a running system
-                size = camera.width, camera.height
-                with timed(_COMPILING):
-                    parser.warm_up(*size)
+            if not parser.compiled_for(camera.width, camera.height):
+                with timed(_COMPILING):  # beforehand, so that `seconds` are those of a running system
+                    parser.warm_up(camera.width, camera.height)
             try:
                 posterior = parser.parse(frame)
             except ParseError as error:

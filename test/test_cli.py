@@ -52,6 +52,9 @@ def parsers(monkeypatch, fake_posterior):
             self.models, self.settings, self.warm = models, settings, []
             made.append(self)
 
+        def compiled_for(self, width, height):
+            return (width, height) in self.warm
+
         def warm_up(self, width, height):
             self.warm.append((width, height))
 
