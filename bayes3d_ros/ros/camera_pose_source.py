@@ -84,11 +84,15 @@ class CameraPoseSource:
         """The nodes that publish poses on the topic."""
         return self._topic.publishers
 
-    def tick(self) -> None:
-        """To be called often."""
-        self._topic.tick()
+    def look(self) -> None:
+        """See who publishes poses; to be called a few times a second."""
+        self._topic.look()
+        self.poll()
+
+    def poll(self) -> None:
+        """To be called often while images wait."""
         if self._tf is not None:
-            self._tf.tick()
+            self._tf.poll()
 
     def images_jumped(self) -> None:
         """The stamps of images have jumped back: poses of before do not count any more."""
@@ -209,13 +213,13 @@ class _Tf:
         return f"{asked}: it came too late"
 
     def renew(self) -> None:
-        """Hear tf anew at the next tick: what the buffer holds is of before a jump, and it refuses what is older.
+        """Hear tf anew at the next poll: what the buffer holds is of before a jump, and it refuses what is older.
         (To clear it would lose /tf_static, which is sent only once to each listener.) The clock and the images tell of
         the same jump; to begin twice would lose what came meanwhile."""
         self._renew |= time.monotonic() - self._renewed >= _JUMP
 
-    def tick(self) -> None:
-        """To be called often."""
+    def poll(self) -> None:
+        """To be called often: begins to hear tf anew, where that is asked for."""
         if self._renew:
             self._renew, self._renewed = False, time.monotonic()
             self._listener.unregister()

@@ -96,7 +96,6 @@ class CameraTrackerNode(Node):
         self.add_post_set_parameters_callback(self._after_set_parameters)
         self._open_inputs()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         self._begin()
 
@@ -204,10 +203,6 @@ class CameraTrackerNode(Node):
         # Only the first frame is placed by a pose; later ones need not wait for theirs.
         settings = self._node_settings()
         self._inputs = DepthInputs(self, self._worker.submit, settings, wants_pose=lambda: self._known is None)
-
-    def _tick(self) -> None:
-        if self._inputs is not None:
-            self._inputs.tick()
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         return self._settings.check(parameters)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -17,6 +18,8 @@ from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 
 DEPTH_TOPIC, INFO_TOPIC = "depth/image_rect", "depth/camera_info"
+_LOOK = 0.2  # seconds between two looks at who publishes
+_POLL = 0.02  # seconds between two looks at what waits, where something does
 
 
 class DepthMessages(NamedTuple):
@@ -69,6 +72,11 @@ class DepthInputs:
                 required=use_pose == "required",
                 on_pose=self._take,
             )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
+        self._node = node
+        self._timers = [node.create_timer(_LOOK, self._look, clock=steady)]
+        self._polling = node.create_timer(_POLL, self._poll, clock=steady)
+        self._timers.append(self._polling)
         self._image_topic = AutoSubscription(
             node, Image, DEPTH_TOPIC, self._on_image, reliability=reliability, depth=10
         )
@@ -107,21 +115,28 @@ class DepthInputs:
             stamps_agree=self._queue.stamps_agree,
         )
 
-    def tick(self) -> None:
-        """To be called some 50 times a second: what has waited too long goes on without."""
-        for subscription in (self._image_topic, self._info_topic):
-            subscription.tick()
-        if self._poses is not None:
-            self._poses.tick()
-        self._take()
-
     def close(self) -> None:
         """Stop listening; what waits is dropped."""
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
         self._image_topic.close()
         self._info_topic.close()
         if self._poses is not None:
             self._poses.close()
         self._queue.clear()
+
+    def _look(self) -> None:
+        """See who publishes, and subscribe as that needs."""
+        for subscription in (self._image_topic, self._info_topic):
+            subscription.look()
+        if self._poses is not None:
+            self._poses.look()
+
+    def _poll(self) -> None:
+        """What has waited too long goes on without; tf is asked anew."""
+        if self._poses is not None:
+            self._poses.poll()
+        self._take()
 
     def _on_image(self, image: Image, latched: bool) -> None:
         self._depth_at = time.monotonic()
@@ -147,8 +162,12 @@ class DepthInputs:
         return self._pose_used.problem or self._poses.refused
 
     def _take(self) -> None:
-        """Deliver the newest complete image, if there is one."""
+        """Deliver the newest complete image, if there is one, and look again soon if another waits."""
         complete = self._queue.take(time.monotonic())
+        if self._queue.waiting == 0:
+            self._polling.cancel()
+        elif self._polling.is_canceled():
+            self._polling.reset()
         if complete is not None:
             self._pose_used = complete.pose
             self._delivered_at = time.monotonic()

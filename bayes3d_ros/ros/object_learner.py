@@ -88,7 +88,6 @@ class ObjectLearnerNode(Node):
         self.add_post_set_parameters_callback(self._after_set_parameters)
         self._open_inputs()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
 
     def stop(self, timeout: float) -> bool:
@@ -259,10 +258,6 @@ class ObjectLearnerNode(Node):
 
     def _keep(self, messages: DepthMessages) -> None:
         self._newest = messages
-
-    def _tick(self) -> None:
-        if self._inputs is not None:
-            self._inputs.tick()
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         return self._settings.check(parameters)

@@ -66,7 +66,6 @@ class SceneParserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._after_set_parameters)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(0.02, self._tick, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         if self.get_parameter("autostart").value:
             self._prepare()
@@ -225,10 +224,6 @@ class SceneParserNode(Node):
             self._dropped_before += self._inputs.dropped
             self._inputs = None
         self._worker.forget()
-
-    def _tick(self) -> None:
-        if self._inputs is not None:
-            self._inputs.tick()
 
     def _process(self, messages: DepthMessages) -> None:
         """On the worker's thread: one frame from messages to messages."""

@@ -1,6 +1,5 @@
 """A subscription that finds the reliability, and where wanted the latched messages, of whoever publishes."""
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -10,8 +9,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-
-_LOOK = 0.2  # seconds between two looks at who publishes
 
 
 class AutoSubscription:
@@ -45,7 +42,6 @@ class AutoSubscription:
         self._change_over = False
         self._want_latched = latched
         self._publishers: list[TopicEndpointInfo] = []
-        self._looked = 0.0
         self._volatile: Subscription = self._subscribe(DurabilityPolicy.VOLATILE)
         self._latched: Subscription | None = None
         self.problem = ""  # why a publisher cannot be heard
@@ -55,19 +51,14 @@ class AutoSubscription:
         """The nodes that publish on the topic, as /namespace/name, one entry a publisher, as of the last look."""
         return tuple(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in self._publishers)
 
-    def tick(self) -> None:
-        """To be called often: looks at who publishes now and then, and subscribes as that needs."""
+    def look(self) -> None:
+        """Look at who publishes, and subscribe as that needs; to be called a few times a second."""
         if self._change_over:
             self._change_over, self._best_effort = False, True
             self.close()
             self._volatile = self._subscribe(DurabilityPolicy.VOLATILE)
             self._node.get_logger().info(f"a publisher on {self.topic} is best effort: subscribing best effort")
-        if time.monotonic() - self._looked >= _LOOK:
-            self.look()
-
-    def look(self) -> None:
-        """Look at who publishes, and subscribe a second time where that is latched."""
-        self._looked, self._publishers = time.monotonic(), self._node.get_publishers_info_by_topic(self.topic)
+        self._publishers = self._node.get_publishers_info_by_topic(self.topic)
         latched = any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in self._publishers)
         if self._want_latched and latched and self._latched is None:
             self._latched = self._subscribe(DurabilityPolicy.TRANSIENT_LOCAL)
