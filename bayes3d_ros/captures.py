@@ -2,13 +2,12 @@
 
 import os
 import tempfile
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.model.npz_file import read_arrays
 from bayes3d_ros.model.observation import DepthFrame
 
 
@@ -60,7 +59,7 @@ class CaptureStore:
         for path in self.paths():
             try:
                 frames.append(_read(path))
-            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            except (OSError, ValueError, KeyError, TypeError) as error:
                 problems.append(f"{path}: expected a capture, cannot read it ({' '.join(str(error).split())[:100]})")
         return frames, problems
 
@@ -78,11 +77,11 @@ class CaptureStore:
 
 
 def _read(path: Path) -> DepthFrame:
-    with np.load(path, allow_pickle=False) as file:
-        depth, (fx, fy, cx, cy) = file["depth"], file["intrinsics"].tolist()
-        stamp, pose = int(file["stamp_ns"]), file["T_table_camera"]
-        frame_id = file["frame_id"].tobytes().decode()
-    if depth.ndim != 2 or pose.shape != (4, 4) or not np.isfinite(pose).all():
+    arrays = read_arrays(path)
+    depth, (fx, fy, cx, cy) = arrays["depth"], arrays["intrinsics"].tolist()
+    stamp, pose = int(arrays["stamp_ns"]), arrays["T_table_camera"]
+    frame_id = arrays["frame_id"].tobytes().decode()
+    if depth.ndim != 2 or depth.dtype != np.float32 or pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError("its arrays have wrong shapes or values")
     height, width = depth.shape
     return DepthFrame(depth, Intrinsics(fx, fy, cx, cy, width, height), stamp, frame_id, pose)

@@ -1,11 +1,10 @@
 """Voxel models of objects, and libraries of them: a folder of small versioned .npz files, one a model."""
 
 import json
+import math
 import os
 import re
 import tempfile
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
+from bayes3d_ros.model.npz_file import read_arrays
 
 FORMAT_VERSION = 1
+_SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -67,8 +68,8 @@ def _check(model: ObjectModel) -> None:
         raise ValueError(f"name must be made of letters, digits, '_' and '-', got {model.name!r}")
     if not isinstance(model.provenance, dict):
         raise ValueError(f"provenance must be a dict, got {model.provenance!r}")
-    if not (np.isfinite(model.voxel_size) and model.voxel_size > 0):
-        raise ValueError(f"voxel_size must be positive, got {model.voxel_size!r}")
+    if not _SMALLEST_VOXEL <= model.voxel_size <= _LARGEST:
+        raise ValueError(f"voxel_size must be positive, {_SMALLEST_VOXEL} to {_LARGEST:g} m, got {model.voxel_size!r}")
     if model.occupancy.ndim != 3 or model.occupancy.dtype != bool or not model.occupancy.any():
         raise ValueError(f"occupancy must be a 3D bool array with a voxel set, got shape {model.occupancy.shape}")
     if model.occupancy.size > MAX_VOXELS:
@@ -92,6 +93,8 @@ def _check(model: ObjectModel) -> None:
             raise ValueError(f"{name} must have shape {shape}, got {value.shape}")
         if not np.isfinite(value).all():
             raise ValueError(f"{name} holds values that are not finite")
+        if np.abs(value).max() > _LARGEST:
+            raise ValueError(f"{name} holds {np.abs(value).max():g}, expected {_LARGEST:g} at most")
     if (model.surface_index < 0).any() or (model.surface_index >= model.occupancy.shape).any():
         raise ValueError(f"surface_index points outside the grid of {model.occupancy.shape} voxels")
     for name in ("surface_normal", "contact_normal"):
@@ -215,11 +218,8 @@ def load_model(path: Path) -> ObjectModel:
         why = "expected a model file, this is a folder" if path.is_dir() else "no such model file"
         raise LibraryError(f"{path}: {why}")
     try:
-        if not zipfile.is_zipfile(path):
-            raise ValueError("not a .npz file, or cut short")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise LibraryError(f"{path}: corrupt or not a model file ({' '.join(str(error).split())[:120]})") from error
     try:
         return _decode(arrays)
@@ -229,25 +229,40 @@ def load_model(path: Path) -> ObjectModel:
         raise LibraryError(f"{path}: {' '.join(str(error).split())[:200]}") from error
 
 
+_TYPES: dict[str, Any] = {
+    "meta": np.uint8,
+    "shape": np.integer,
+    "occupancy": np.uint8,
+    "surface": np.uint8,
+    "surface_normal": np.int8,
+    "surface_offset": np.int8,
+    "frames": np.float64,
+    "contact_normal": np.float64,
+    "surface_views": np.uint8,
+}
+
+
 def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
+    for name, kind in _TYPES.items():
+        if name in arrays and not np.issubdtype(arrays[name].dtype, kind):
+            raise ValueError(f"{name} must be of type {kind.__name__}, got {arrays[name].dtype}")
     meta = _decode_meta(arrays["meta"])
     voxel_size = meta["voxel_size"]
     shape = tuple(int(n) for n in arrays["shape"])
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(f"shape must be three positive numbers, got {shape}")
-    cells = int(np.prod(shape))
+    cells = math.prod(shape)
+    if cells > MAX_VOXELS:
+        raise ValueError(f"shape may have {MAX_VOXELS} voxels at most, got {shape}")
     masks = {}
     for name in ("occupancy", "surface"):
         packed = arrays[name]
-        if packed.dtype != np.uint8 or packed.shape != ((cells + 7) // 8,):
+        if packed.shape != ((cells + 7) // 8,):
             raise ValueError(f"{name} must hold {(cells + 7) // 8} bytes for a grid of {shape}, got {packed.shape}")
         masks[name] = np.unpackbits(packed, count=cells).astype(bool).reshape(shape)
     index = np.argwhere(masks["surface"])
     normal, offset = arrays["surface_normal"].T.astype(float), arrays["surface_offset"].astype(float)
     frames = arrays["frames"]
-    for name in ("frames", "contact_normal"):
-        if arrays[name].dtype != np.float64:
-            raise ValueError(f"{name} must hold 64-bit floats, got {arrays[name].dtype}")
     if normal.shape != (len(index), 3) or offset.shape != (len(index),):
         raise ValueError(f"surface_normal and surface_offset must describe {len(index)} surface voxels")
     if frames.shape != (24,):
@@ -271,8 +286,8 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
 
 def _decode_meta(array: np.ndarray) -> dict:
     try:
-        meta = json.loads(array.astype(np.uint8).tobytes().decode())
-    except ValueError as error:
+        meta = json.loads(array.tobytes().decode())
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"meta must be JSON ({error})") from error
     if not isinstance(meta, dict):
         raise ValueError("meta must be a JSON object")

@@ -188,7 +188,13 @@ def test_a_plain_array_is_refused(tmp_path):
         ({"frames": np.zeros(23)}, "frames must hold 24 numbers"),
         ({"shape": np.array([2, 2])}, "shape must be three positive"),
         ({"shape": np.array([2, 2, -2])}, "shape must be three positive"),
+        ({"shape": np.array([2**31 - 1] * 3)}, "shape may have 16777215 voxels at most"),
+        ({"shape": np.array([2.0, np.inf, 2.0])}, "shape must be of type integer, got float64"),
         ({"occupancy": np.zeros(3, np.uint8)}, "occupancy must hold"),
+        ({"surface_normal": np.zeros((3, 4), complex)}, "surface_normal must be of type int8, got complex128"),
+        ({"frames": np.full(24, 1e308)}, r"origin holds 1e\+308, expected 100000 at most"),
+        ({"contact_normal": np.full((6, 3), 1e308)}, "contact_normal holds"),
+        ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "meta"),
         ({"surface_normal": np.zeros((3, 4), np.int8)}, "must describe"),
         ({"surface_offset": np.zeros(4, np.int8)}, "must describe"),
         ({"contact_normal": np.zeros((5, 3))}, "contact_normal must have shape"),
@@ -216,6 +222,7 @@ def test_wrong_fields_are_named(model, tmp_path, changes, reason):
         ({"name": 3}, "name must be made of"),
         ({"voxel_size": -1.0}, "voxel_size must be positive"),
         ({"voxel_size": "wide"}, "voxel_size"),
+        ({"voxel_size": 5e-324}, "voxel_size must be positive, 1e-06 to 100000 m"),
         ({"provenance": 3}, "provenance must be"),
     ],
 )
@@ -246,3 +253,70 @@ def test_a_zip_with_foreign_entries_is_refused(tmp_path):
         file.writestr("photo.jpg", b"1234")
     with pytest.raises(LibraryError):
         load_library(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000000000,), }",
+        b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000000000000000,), }",
+        b"{'descr': '|u1', 'fortran_order': False, 'shape': (4,), ",
+        b"{'descr': '|u1, 'fortran_order': False, 'shape': (4,), }",
+        b"\x00\xff(",
+    ],
+)
+def test_a_header_that_lies_is_one_line(tmp_path, header):
+    entry = b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n" + bytes(4)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
+        file.writestr("meta.npy", entry)
+    with pytest.raises(LibraryError, match="a.npz: corrupt or not a model file") as error:
+        load_model(tmp_path / "a.npz")
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_unpacks_to_more_than_any_model_is_not_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as file, file.open("meta.npy", "w") as entry:
+        for _ in range(17):
+            entry.write(bytes(2**24))
+    with pytest.raises(LibraryError, match="a.npz: .* bytes, expected 268435456 at most"):
+        load_model(tmp_path / "a.npz")
+
+
+@pytest.mark.filterwarnings("error")
+def test_damage_of_any_kind_is_one_line(model, tmp_path):
+    """150 damaged copies; whichever can still be read is a model."""
+    path, rng = save_model(model, tmp_path), np.random.default_rng(0)
+    whole = path.read_bytes()
+    with np.load(path) as file:
+        fields = {name: file[name] for name in file.files}
+    refused = 0
+    for k in range(150):
+        if k % 3:
+            path.write_bytes(damaged_bytes(whole, rng))
+        else:
+            np.savez(path, **damaged_fields(fields, rng))
+        try:
+            load_library(tmp_path)
+        except LibraryError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 120
+
+
+def damaged_bytes(whole, rng):
+    """Some bytes changed, cut out, repeated, or everything from somewhere on left out."""
+    a, b = np.sort(rng.integers(len(whole), size=2))
+    kinds = (whole[:a], whole[:a] + whole[b:], whole[:b] + whole[a:], whole[:a] + rng.bytes(9) + whole[a + 9 :])
+    return kinds[rng.integers(4)]
+
+
+def damaged_fields(fields, rng):
+    """One of the arrays missing, of another type or shape, or with a value that cannot be."""
+    fields = dict(fields)
+    name = rng.choice(sorted(fields))
+    array = fields.pop(name)
+    wrong = array.astype(float)
+    wrong.flat[rng.integers(wrong.size)] = rng.choice([np.nan, np.inf, -1e308, 5e-324])
+    others = [array.astype(complex), array.astype("U3"), array.ravel()[:-1], np.array(5), array[None], wrong]
+    kind = rng.integers(len(others) + 1)
+    return fields if kind == len(others) else fields | {str(name): others[kind]}

@@ -1,0 +1,34 @@
+"""Arrays of .npz files that others may have written or damaged."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+MOST_BYTES = 2**28  # of all arrays together; models and captures hold a few megabytes
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of a file, by name. Raises ValueError, one line, where it cannot be read as such, holds pickles, or is
+    larger than any file of ours; OSError where the file itself cannot be read."""
+    with path.open("rb") as file:
+        try:
+            if not zipfile.is_zipfile(file):
+                raise ValueError("not a .npz file, or cut short")
+            with zipfile.ZipFile(file) as entries:
+                size = sum(entry.file_size for entry in entries.infolist())
+            if size > MOST_BYTES:
+                raise ValueError(f"its arrays take {size} bytes, expected {MOST_BYTES} at most")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                found = {name: arrays[name] for name in arrays.files}
+        except OSError:
+            raise
+        # A header that lies about its array's size is a MemoryError; else zipfile, zlib, numpy and Python's own parser,
+        # which reads the headers, each raise their own kinds.
+        except Exception as error:
+            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            raise ValueError(reason) from error
+    if not all(isinstance(array, np.ndarray) for array in found.values()):
+        raise ValueError("holds entries that are no arrays")
+    return found
