@@ -1,5 +1,6 @@
 """Bags: what is written is read; topics are found by the documented rules; whatever is broken is one clear line."""
 
+import io
 import json
 from pathlib import Path
 
@@ -312,3 +313,52 @@ def test_bundled_bags_hold_what_their_truth_says(name):
 
 def test_bundled_bags_are_small():
     assert sum(file.stat().st_size for file in BUNDLED.rglob("*") if file.is_file()) < 12e6
+
+
+def test_damage_of_any_kind_is_one_line(tmp_path):
+    """100 damaged copies of a recording: bytes of the file, or of messages whose record is whole."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for k in range(3):
+            writer.write(frame(k))
+    (recorded,) = (tmp_path / "bag").glob("*.mcap")
+    whole, messages = recorded.read_bytes(), list(raw_messages(recorded))
+    rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.mcap", 0
+    for k in range(100):
+        path.write_bytes(damaged_bytes(whole, rng) if k % 2 else with_damaged_messages(messages, rng))
+        try:
+            for found in read_frames(path):
+                assert np.isfinite(found.intrinsics.rays()).all()
+                assert found.T_table_camera is None or np.isfinite(found.T_table_camera).all()
+        except BagError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 60
+
+
+def damaged_bytes(whole, rng):
+    """Some bytes changed, cut out, repeated, or everything from somewhere on left out."""
+    a, b = np.sort(rng.integers(len(whole), size=2))
+    kinds = (whole[:a], whole[:a] + whole[b:], whole[:b] + whole[a:], whole[:a] + rng.bytes(9) + whole[a + 9 :])
+    return kinds[rng.integers(4)]
+
+
+def with_damaged_messages(messages, rng):
+    """A whole file, some of whose messages are left out, cut short, repeated, or changed where their fields are."""
+    buffer = io.BytesIO()
+    writer = McapWriter(buffer, compression=CompressionType.NONE, enable_crcs=False)
+    writer.start()
+    channels = {}
+    for message in messages:
+        if message.topic not in channels:
+            schema = writer.register_schema(message.msgtype, "ros2msg", b"")
+            channels[message.topic] = writer.register_channel(message.topic, "cdr", schema)
+        data, kind = bytearray(message.data), rng.integers(6)
+        if kind == 0:
+            data = data[: rng.integers(len(data))]
+        elif kind == 1:
+            for at in rng.integers(min(len(data), 400), size=3):
+                data[at] = rng.integers(256)
+        for _ in range({2: 0, 3: 2}.get(int(kind), 1)):
+            writer.add_message(channels[message.topic], message.t_ns, bytes(data), message.t_ns)
+    writer.finish()
+    return buffer.getvalue()
