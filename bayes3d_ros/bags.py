@@ -33,6 +33,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POSE = "geometry_msgs/msg/PoseStamped"
 DEPTH_TOPIC, INFO_TOPIC, POSE_TOPIC = "/depth/image_rect", "/depth/camera_info", "/camera_pose"
 TABLE_FRAME = "table"
+_FARTHEST = 1e5  # metres from the table's origin that a camera may be
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -176,9 +177,10 @@ class FrameReader:
     def _matrix(self, pose: Any) -> Float[np.ndarray, "4 4"]:
         p, q = pose.position, pose.orientation
         position, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-        if not np.isfinite(position).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
+        usable = (np.abs(position) < _FARTHEST).all() and (np.abs(quaternion) < 2).all()  # of NaN neither is true
+        if not usable or not 0.9 < np.linalg.norm(quaternion) < 1.1:
             got = " ".join(f"{v:g}" for v in (*position, *quaternion))
-            expected = "expected finite poses x y z qx qy qz qw with unit quaternions"
+            expected = f"expected finite poses x y z qx qy qz qw within {_FARTHEST:g} m, with unit quaternions"
             raise BagError(f"{self.bag}: {self.pose_topic}: {expected}, got {got}")
         return pose_matrix(position, quaternion)
 

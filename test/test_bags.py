@@ -315,6 +315,7 @@ def test_bundled_bags_are_small():
     assert sum(file.stat().st_size for file in BUNDLED.rglob("*") if file.is_file()) < 12e6
 
 
+@pytest.mark.filterwarnings("error")
 def test_damage_of_any_kind_is_one_line(tmp_path):
     """100 damaged copies of a recording: bytes of the file, or of messages whose record is whole."""
     with BagWriter(tmp_path / "bag") as writer:
