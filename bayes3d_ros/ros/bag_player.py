@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -18,19 +18,27 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
+from bayes3d_ros.ros.names import played
 from bayes3d_ros.ros.spinning import shut_down, until_stopped
 from bayes3d_ros.ros.transport import use_large_messages
 
 CLOCK_PERIOD = 0.01  # seconds of real time
 ACKNOWLEDGED_SECONDS = 4.0  # a little longer than Fast DDS takes to ask again for what was lost
+REPORT_PERIOD = 10.0  # seconds between two lines about loops
+SETTLE_SECONDS = 0.5  # from a node's first subscription to the last that it makes at the same time
 
 
 class BagPlayer(Node):
-    """Publishes the recorded CDR bytes, reliable, at the times they were recorded."""
+    """Publishes the recorded CDR bytes, reliable, at the times they were recorded.
+
+    A player in a namespace (-r __ns:=/left) publishes in it: recorded /depth/image_rect as /left/depth/image_rect.
+    """
 
     def __init__(self, bag: Path, only: list[str], clock: bool) -> None:
         super().__init__("bag_player")
         self._bag = bag
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
         self.publishers_of: dict[str, Publisher] = {}
         for name, topic in topics(bag).items():
             if only and name not in only:
@@ -46,7 +54,7 @@ class BagPlayer(Node):
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
-            self.publishers_of[name] = self.create_publisher(kind, name, qos)
+            self.publishers_of[name] = self.create_publisher(kind, played(name, self.get_namespace()), qos)
         if not self.publishers_of:
             has = ", ".join(topics(bag)) or "none"
             raise BagError(f"{bag}: expected topics to play{': ' + ', '.join(only) if only else ''}; the bag has {has}")
@@ -54,15 +62,31 @@ class BagPlayer(Node):
 
     def unheard(self) -> list[str]:
         """The topics that nobody subscribes to."""
-        return [name for name, publisher in self.publishers_of.items() if publisher.get_subscription_count() == 0]
+        return [p.topic_name for p in self.publishers_of.values() if p.get_subscription_count() == 0]
 
-    def wait_for_subscribers(self, seconds: float) -> None:
-        """Wait until every topic has a subscriber, but not longer than this."""
+    def wait_for_subscribers(self, seconds: float, node: str = "") -> None:
+        """Wait until every topic has a subscriber, or a node of this full name has subscribed, but not longer."""
         deadline = time.monotonic() + seconds
-        while self.unheard() and time.monotonic() < deadline:
-            rclpy.spin_once(self, timeout_sec=0.05)
-        if self.unheard():
-            self.get_logger().warning(f"nobody subscribes to {', '.join(self.unheard())}; playing all the same")
+        while (unheard := not self._hears(node) if node else bool(self.unheard())) and time.monotonic() < deadline:
+            self._spin(0.05)
+        if node and not unheard:
+            self._spin(SETTLE_SECONDS)
+        elif unheard:
+            who, what = (node, "any topic") if node else ("nobody", ", ".join(self.unheard()))
+            does = "does not subscribe" if node else "subscribes"
+            self.get_logger().warning(f"{who} {does} to {what}; playing all the same")
+
+    def _hears(self, node: str) -> bool:
+        """Whether a node subscribes to a topic of the bag."""
+        topics = [publisher.topic_name for publisher in self.publishers_of.values()]
+        ends = [end for topic in topics for end in self.get_subscriptions_info_by_topic(topic)]
+        return any(f"{end.node_namespace.rstrip('/')}/{end.node_name}" == node for end in ends)
+
+    def _spin(self, seconds: float) -> None:
+        """Answer parameter services and the like for so long."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
 
     def play(self, rate: float) -> int:
         """Publish every message once; the number published. Raises BagDamage at the damaged end of a bag."""
@@ -87,13 +111,14 @@ class BagPlayer(Node):
         return (message for message in raw_messages(self._bag) if message.topic in self.publishers_of)
 
     def _wait_until(self, start: float, first_ns: int, t_ns: int, rate: float) -> None:
-        """Sleep until a recorded time is due, keeping the clock going."""
+        """Spin until a recorded time is due, keeping the clock going."""
         due = start + (t_ns - first_ns) * 1e-9 / rate
         while (left := due - time.monotonic()) > 0:
             if not rclpy.ok():
                 raise ExternalShutdownException
             self._publish_clock(t_ns - int(left * rate * 1e9))
-            time.sleep(min(left, CLOCK_PERIOD if self._clock_publisher else 0.1))
+            self._spin(min(left, CLOCK_PERIOD if self._clock_publisher else 0.1))
+        self._executor.spin_once(timeout_sec=0.0)  # also where messages are due faster than they can be published
         self._publish_clock(t_ns)
 
     def _publish_clock(self, t_ns: int) -> None:
@@ -124,6 +149,7 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--loop", action="store_true", help="start again at the end; stamps go backwards then")
     parser.add_argument("--clock", action="store_true", help="publish /clock, for nodes with use_sim_time")
     parser.add_argument("--wait", type=_seconds, default=1.0, help="seconds to wait for a subscriber on every topic")
+    parser.add_argument("--wait-for", default="", metavar="NODE", help="wait for this node's subscriptions instead")
     parser.add_argument("--topics", nargs="+", default=[], help="play only these")
     return parser.parse_args(argv)
 
@@ -159,10 +185,14 @@ def main(args: list[str] | None = None) -> int:
             use_large_messages()
             rclpy.init(args=argv)
             player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
-            player.wait_for_subscribers(arguments.wait)
+            player.wait_for_subscribers(arguments.wait, arguments.wait_for)
+            loops, told = 0, float("-inf")
             while True:
-                played = player.play(arguments.rate)
-                player.get_logger().info(f"played {played} messages of {arguments.bag}")
+                count, loops = player.play(arguments.rate), loops + 1
+                if time.monotonic() - told >= REPORT_PERIOD:
+                    told = time.monotonic()
+                    again = f", {loops} times so far" if loops > 1 else ""
+                    player.get_logger().info(f"played {count} messages of {arguments.bag}{again}")
                 if not arguments.loop:
                     break
             player.finish(ACKNOWLEDGED_SECONDS)

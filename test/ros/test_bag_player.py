@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rcl_interfaces.srv import ListParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
@@ -58,6 +59,26 @@ def test_a_loop_publishes_what_was_recorded_again_and_again_with_the_clock(ros, 
     np.testing.assert_allclose(conversions.depth_from_image(images[0]), depth_frame().depth, atol=6e-4)
     times = [conversions.stamp_to_ns(m.clock) for m in clock]
     assert min(times) >= 10**9 and max(times) <= 10**9 + 2 * 10**7
+    assert player.stop() == 0, player.output()
+
+
+def test_a_short_loop_logs_once_and_answers_services_meanwhile(ros, bag: Path) -> None:
+    images = ros.listen(Image, "/depth/image_rect", 100)
+    player = ros.start("-m", "bayes3d_ros.ros.bag_player", str(bag), "--loop", "--topics", "/depth/image_rect")
+    ros.wait_for(lambda: len(images) > 3, "a second loop")
+    answer = ros.call(ListParameters, "/bag_player/list_parameters", ListParameters.Request())
+    assert "use_sim_time" in answer.result.names
+    ros.wait_for(lambda: len(images) > 60, "twenty loops")
+    assert player.output().count("played 3 messages") == 1
+
+
+def test_in_a_namespace_everything_is_played_in_it(ros, bag: Path) -> None:
+    images = ros.listen(Image, "/left/depth/image_rect", 100)
+    rules = ["--ros-args", "-r", "__ns:=/left"]
+    player = ros.start("-m", "bayes3d_ros.ros.bag_player", str(bag), "--wait", "60", "--wait-for", "/test", *rules)
+    ros.wait_for(lambda: len(images) == 3, "three images")  # though nobody listens to the other topics
+    topics = {name for name, _ in ros.node.get_topic_names_and_types()}
+    assert "/left/depth/camera_info" in topics and "/depth/camera_info" not in topics
     assert player.stop() == 0, player.output()
 
 
