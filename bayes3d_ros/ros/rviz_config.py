@@ -1,0 +1,30 @@
+"""The RViz configuration of a scene_parser: config/bayes3d.rviz with the names that it really has."""
+
+from typing import Any
+
+import yaml
+
+from bayes3d_ros.resources import share_directory
+
+NODE, DEPTH = "/scene_parser", "/depth/image_rect"  # in the file, which fits a node of that name as it is
+# image_transport takes the CameraInfo of an image from this name beside it; RViz has no setting for it.
+INFO_BESIDE_IMAGE = "camera_info"
+
+
+def rviz_config(node: str, depth: str, frame: str) -> str:
+    """The text of a configuration for a scene_parser, given full names, and with `frame` as RViz's fixed frame."""
+    config = yaml.safe_load((share_directory() / "config" / "bayes3d.rviz").read_text())
+    config["Visualization Manager"]["Global Options"]["Fixed Frame"] = frame
+
+    def named(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: named(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [named(item) for item in value]
+        if value == DEPTH:
+            return depth
+        if isinstance(value, str) and value.startswith(f"{NODE}/"):
+            return node + value.removeprefix(NODE)
+        return value
+
+    return yaml.safe_dump(named(config), sort_keys=False)
