@@ -10,13 +10,18 @@ _CHOICES = (
 )
 
 
+def chosen_transport() -> bool:
+    """Whether the environment tells Fast DDS how to send."""
+    return any(os.environ.get(name) for name in _CHOICES)
+
+
 def use_large_messages() -> None:
     """Use config/fastdds.xml, unless the user has chosen something; to be called before rclpy.init.
 
     In the half megabyte that Fast DDS takes by default an image crowds out what is sent beside it: best-effort images
     are lost, and a reliable CameraInfo or pose of the same stamp comes seconds later, when it is asked for again.
     """
-    if any(os.environ.get(name) for name in _CHOICES):
+    if chosen_transport():
         return
     try:
         os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(share_directory() / "config" / "fastdds.xml")
