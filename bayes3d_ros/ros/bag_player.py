@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
 from bayes3d_ros.ros.names import played
-from bayes3d_ros.ros.spinning import end_with_launch, shut_down, until_stopped
+from bayes3d_ros.ros.spinning import shut_down, until_stopped
 from bayes3d_ros.ros.transport import use_large_messages
 
 CLOCK_PERIOD = 0.01  # seconds of real time
@@ -182,7 +182,6 @@ def main(args: list[str] | None = None) -> int:
     status = 0
     try:
         with until_stopped():
-            end_with_launch()
             use_large_messages()
             rclpy.init(args=argv)
             player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)

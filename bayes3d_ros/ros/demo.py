@@ -100,10 +100,9 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     processes: dict[str, NodeProcess] = {}
+    node, executor = Node("demo", context=context), SingleThreadedExecutor(context=context)
     try:
-        node = Node("demo", context=context)
         outputs = Outputs(node)
-        executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         parameters = {"library": out / "library", "warm_up_width": frame.depth.shape[1]}
         parameters["warm_up_height"] = frame.depth.shape[0]
@@ -116,6 +115,8 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
         _wait(executor, outputs, frame.stamp_ns, processes, say)
     finally:
         statuses = {name: process.stop() for name, process in processes.items()}
+        executor.shutdown()
+        node.destroy_node()
         shut_down(context)
     for name, status in statuses.items():
         if status != 0:

@@ -25,7 +25,6 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.names import full_name, played, resolved
 from bayes3d_ros.ros.rviz_config import INFO_BESIDE_IMAGE, rviz_config
-from bayes3d_ros.ros.spinning import LAUNCH_PID
 from bayes3d_ros.ros.transport import chosen_transport
 
 PACKAGE = "bayes3d_ros"
@@ -102,7 +101,7 @@ def _actions(context: LaunchContext, executable: str, values: dict[str, str], pa
     topics = {key: played(values[key], namespace) if bag else values[key] for key in INPUTS}
     tf = [(topic, played(topic, namespace)) for topic in ("/tf", "/tf_static")] if bag and namespace != "/" else []
     profile = IfCondition(values["fastdds_profile"]).evaluate(context)
-    environment = {LAUNCH_PID: str(os.getpid()), **({} if chosen_transport() else _transport(profile))}
+    environment = {} if chosen_transport() else _transport(profile)
     node = Node(
         package=PACKAGE,
         executable=executable,

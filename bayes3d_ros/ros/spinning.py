@@ -1,6 +1,5 @@
 """Run a node until it is told to stop; every end is a clean one."""
 
-import ctypes
 import os
 import signal
 import sys
@@ -16,8 +15,6 @@ from rclpy.node import Node
 from bayes3d_ros.ros.transport import use_large_messages
 
 _PATIENCE = 0.3  # seconds that a frame may still take when a node is told to stop
-LAUNCH_PID = "BAYES3D_ROS_LAUNCH_PID"  # the environment variable by which a launch file names its own process
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class StoppableNode(Protocol):
@@ -38,7 +35,6 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
     node = None
     try:
         with until_stopped():
-            end_with_launch()
             use_large_messages()
             rclpy.init(args=args)
             node = make_node()
@@ -78,22 +74,6 @@ def until_stopped() -> Iterator[None]:
     finally:
         ended = True
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def end_with_launch() -> None:
-    """Have SIGINT sent to this process when the launch that started it ends, however it does; within until_stopped.
-
-    launch stops what it has started, but not when it is killed, nor what it was about to start when a launch file
-    failed.
-    """
-    launch = os.environ.get(LAUNCH_PID)
-    if launch is None or sys.platform != "linux":
-        return
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
-    try:
-        os.kill(int(launch), 0)
-    except ProcessLookupError:  # it had ended before
-        raise KeyboardInterrupt from None
 
 
 def shut_down(context: Context | None = None) -> None:

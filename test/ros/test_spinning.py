@@ -1,14 +1,11 @@
 """Signals end a node without an exception, whenever they come."""
 
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
 from rclpy.executors import ExternalShutdownException
 
-from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import spinning
 
 
@@ -59,15 +56,3 @@ def test_a_signal_may_come_out_of_rclpy_as_another_exception(monkeypatch, runnin
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
         raise RuntimeError("taking a message failed")
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent has ended")
-@pytest.mark.parametrize("module", ["object_learner", "bag_player"])
-def test_a_launch_that_ended_before_its_node_had_started(ros, monkeypatch, module: str) -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    monkeypatch.setenv(spinning.LAUNCH_PID, str(gone.pid))
-    words = [str(share_directory() / "bags" / "one_object"), "--loop"] if module == "bag_player" else []
-    process = ros.start("-m", f"bayes3d_ros.ros.{module}", *words)
-    ros.wait_for(lambda: process.status is not None, "the end")
-    assert process.status == 0 and process.output() == ""
