@@ -60,7 +60,8 @@ class InputView:
 def why_no_input(view: InputView) -> str:
     """Why no image with its CameraInfo arrives, in one line; empty where both do."""
     for topic in (view.image, view.info):
-        if topic.live:
+        sent_once = topic is view.info and topic.age is not None  # the last CameraInfo goes on to serve
+        if topic.live or sent_once:
             continue
         if not topic.publishers:
             past = "" if topic.age is None else " any more"
@@ -70,9 +71,7 @@ def why_no_input(view: InputView) -> str:
         if topic.age is None:
             count = len(topic.publishers)
             return f"no message yet on {topic.name} ({count} publisher{'s' * (count > 1)})"
-        if topic is view.image:
-            return f"no message on {topic.name} for {topic.age:.0f} s"
-        # CameraInfo may well be sent only once: the last one goes on to serve.
+        return f"no message on {topic.name} for {topic.age:.0f} s"
     return ""
 
 
