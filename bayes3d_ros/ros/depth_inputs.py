@@ -4,8 +4,6 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import Float
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
@@ -29,11 +27,6 @@ class DepthMessages(NamedTuple):
     info: CameraInfo
     pose: CameraPose
     arrived: float
-
-    @property
-    def T_table_camera(self) -> Float[np.ndarray, "4 4"] | None:
-        """The camera's pose in the table's frame, if there is one."""
-        return self.pose.T_table_camera
 
 
 class DepthInputs:
@@ -74,9 +67,8 @@ class DepthInputs:
             )
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
         self._node = node
-        self._timers = [node.create_timer(_LOOK, self._look, clock=steady)]
+        self._looking = node.create_timer(_LOOK, self._look, clock=steady)
         self._polling = node.create_timer(_POLL, self._poll, clock=steady)
-        self._timers.append(self._polling)
         self._image_topic = AutoSubscription(
             node, Image, DEPTH_TOPIC, self._on_image, reliability=reliability, depth=10
         )
@@ -117,7 +109,7 @@ class DepthInputs:
 
     def close(self) -> None:
         """Stop listening; what waits is dropped."""
-        for timer in self._timers:
+        for timer in (self._looking, self._polling):
             self._node.destroy_timer(timer)
         self._image_topic.close()
         self._info_topic.close()

@@ -261,4 +261,5 @@ def where_images_are(view: InputView) -> str:
     images = f"{view.waiting} image{'s wait' if view.waiting > 1 else ' waits'} for"
     if view.info.age is None:
         return f"{images} CameraInfo on {view.info.name}"
-    return f"{images} CameraInfo of their stamp on {view.info.name}, or the camera's pose ({view.pose_topic}, tf)"
+    pose = f", or the camera's pose ({view.pose_topic}, tf)" if view.pose_topic else ""
+    return f"{images} CameraInfo of their stamp on {view.info.name}{pose}"
