@@ -1,23 +1,38 @@
 """Nodes in processes of their own, on a ROS domain that nobody else on this machine uses."""
 
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
+from functools import cache
 from pathlib import Path
 
 
 def free_domain() -> int:
-    """A ROS domain without a participant on this machine: its discovery port can be bound."""
+    """A ROS domain that no other process on this machine has taken by this function, and in which nobody listens for
+    others on the usual port; the same one again for a process that asks again."""
+    return _claim(os.getpid())
+
+
+@cache
+def _claim(process: int) -> int:
     for k in range(100):
-        domain = 1 + (os.getpid() + k) % 100
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
+        domain = 1 + (process + k) % 100
+        try:
+            # Held until the process ends. Nodes that keep to this machine need not bind a port that others could see.
+            lock = os.open(Path(tempfile.gettempdir()) / f"bayes3d_ros_domain_{domain}.lock", os.O_RDWR | os.O_CREAT)
+        except OSError:  # another user's
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind(("", 7400 + 250 * domain))
-                return domain
-            except OSError:
-                continue
+            return domain
+        except OSError:
+            os.close(lock)
     raise RuntimeError("expected a free ROS domain between 1 and 100, all are in use")
 
 
