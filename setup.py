@@ -67,10 +67,10 @@ setup(
     entry_points={
         "console_scripts": [
             "bayes3d = bayes3d_ros.cli:main",
-            "scene_parser = bayes3d_ros.ros.scene_parser:main",
-            "object_learner = bayes3d_ros.ros.object_learner:main",
-            "camera_tracker = bayes3d_ros.ros.camera_tracker:main",
-            "bag_player = bayes3d_ros.ros.bag_player:main",
+            "scene_parser = bayes3d_ros.ros.entry:scene_parser",
+            "object_learner = bayes3d_ros.ros.entry:object_learner",
+            "camera_tracker = bayes3d_ros.ros.entry:camera_tracker",
+            "bag_player = bayes3d_ros.ros.entry:bag_player",
         ],
     },
 )

@@ -1,5 +1,6 @@
 """Where the camera stands: from the camera_pose topic, from tf, or from parameters, in that order."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ except ImportError:
     tf2_ros = None
 
 _JUMP = 1.0  # seconds backwards, after which tf is heard anew; of real time, in which that is done once
-_TF_MEMORY_NS = 10_000_000_000  # tf2 forgets, and refuses, what is this much older than the newest transform
+_TF_MEMORY = 10.0  # seconds: tf2 forgets, and refuses, what is this much older than the newest transform
 _HISTORY = 2.0  # seconds of poses that are kept beyond `patience`
 
 
@@ -94,9 +95,9 @@ class CameraPoseSource:
         if self._tf is not None:
             self._tf.poll()
 
-    def images_jumped(self) -> None:
-        """The stamps of images have jumped back: poses of before do not count any more."""
-        self._history.forget_before(time.monotonic() - _JUMP)
+    def images_jumped(self, stamp_ns: int) -> None:
+        """The stamps of images have jumped back to this one: poses of before do not count any more."""
+        self._history.jumped_back(stamp_ns, time.monotonic())
         if self._tf is not None:
             self._tf.renew()
 
@@ -105,7 +106,7 @@ class CameraPoseSource:
         pose = self._history.at(stamp_ns)
         if pose is not None:
             return CameraPose(pose, "topic")
-        if self._history.static is not None and not self._history.moving:
+        if self._history.static is not None:
             return CameraPose(self._history.static, "topic")
         pose = None if self._tf is None else self._tf.lookup(stamp_ns, camera_frame)
         if pose is not None:
@@ -147,8 +148,6 @@ class CameraPoseSource:
         pose = None if self._tf is None else self._tf.latest(stamp_ns, camera_frame, self._tolerance)
         if pose is not None:
             return CameraPose(pose, "tf")
-        if self._history.static is not None:
-            return CameraPose(self._history.static, "topic")
         problem = self._why_none(stamp_ns, camera_frame)
         if problem or self._fixed is None:
             return CameraPose(None, "none", problem)
@@ -158,7 +157,9 @@ class CameraPoseSource:
         """Why there is no pose on the topic, or in tf; empty where neither is in use."""
         reasons = []
         nearest = self._history.nearest(stamp_ns)
-        if self.refused:
+        if self._topic.problem:
+            reasons.append(self._topic.problem)
+        elif self.refused and self.publishers:
             reasons.append(self.refused)
         elif nearest is not None:
             side = "older" if nearest.seconds < 0 else "newer"
@@ -183,40 +184,45 @@ class _Tf:
 
     def __init__(self, node: Node, table_frame: str) -> None:
         self._node, self._table_frame = node, table_frame
-        self._renew, self._renewed = False, -_JUMP
+        self._renew, self._renewed = False, -math.inf
+        self._connected: set[str] = set()  # camera frames that tf has connected with the table
+        self._failure = ""  # of the last lookup
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-_JUMP), on_clock_change=True)
         self._clock_jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
         self._listen()
 
     def lookup(self, stamp_ns: int, camera_frame: str) -> Float[np.ndarray, "4 4"] | None:
         """The pose at a stamp as tf2 knows it: exact, interpolated or static."""
-        return self._ask(Time(nanoseconds=stamp_ns), camera_frame)[0]
+        return self._ask(_time(stamp_ns), camera_frame)[0]
 
     def latest(self, stamp_ns: int, camera_frame: str, tolerance: float) -> Float[np.ndarray, "4 4"] | None:
         """The newest pose, if its stamp is at most `tolerance` seconds from an image's."""
         pose, newest = self._ask(Time(), camera_frame)
-        if newest > stamp_ns + _TF_MEMORY_NS:
-            self.renew()  # a transform of before a jump came after it
-        return pose if abs(newest - stamp_ns) <= tolerance * 1e9 else None
+        if pose is not None and abs(newest - stamp_ns) <= tolerance * 1e9:
+            return pose
+        self._ask(_time(stamp_ns), camera_frame)
+        if camera_frame in self._connected and "extrapolation into the future" not in self._failure:
+            self.renew(_TF_MEMORY)  # a transform of before a jump, or with a wrong stamp, keeps out what is older
+        return None
 
     def connects(self, camera_frame: str) -> bool:
-        """Whether tf knows how the camera and the table are connected, at any time."""
-        return self._ask(Time(), camera_frame)[0] is not None
+        """Whether tf knows, or has known, how the camera and the table are connected."""
+        if camera_frame not in self._connected:
+            self._ask(Time(), camera_frame)
+        return camera_frame in self._connected
 
     def why(self, stamp_ns: int, camera_frame: str) -> str:
         """Why there is no pose: tf2's own words, and both frames."""
-        asked = f"tf {self._table_frame!r} <- {camera_frame!r}"
-        try:
-            self._buffer.lookup_transform(self._table_frame, camera_frame, Time(nanoseconds=stamp_ns))
-        except tf2_ros.TransformException as error:
-            return f"{asked}: {' '.join(str(error).split())}"
-        return f"{asked}: it came too late"
+        found, _ = self._ask(_time(stamp_ns), camera_frame)
+        told = self._failure if found is None else "it came too late"
+        return f"tf {self._table_frame!r} <- {camera_frame!r}: {told}"
 
-    def renew(self) -> None:
-        """Hear tf anew at the next poll: what the buffer holds is of before a jump, and it refuses what is older.
-        (To clear it would lose /tf_static, which is sent only once to each listener.) The clock and the images tell of
-        the same jump; to begin twice would lose what came meanwhile."""
-        self._renew |= time.monotonic() - self._renewed >= _JUMP
+    def renew(self, apart: float = _JUMP) -> None:
+        """Hear tf anew at the next poll, and know no pose until then: what the buffer holds is of before a jump, and it
+        refuses what is older. (To clear it would lose /tf_static, which is sent only once to each listener.) Not within
+        `apart` seconds of the last time: the clock and the images tell of the same jump, and to begin twice would lose
+        what came meanwhile."""
+        self._renew |= time.monotonic() - self._renewed >= apart
 
     def poll(self) -> None:
         """To be called often: begins to hear tf anew, where that is asked for."""
@@ -239,13 +245,26 @@ class _Tf:
 
     def _ask(self, stamp: Time, camera_frame: str) -> tuple[Float[np.ndarray, "4 4"] | None, int]:
         """The pose and its stamp in nanoseconds."""
+        if self._renew:
+            self._failure = "the clock, or the stamps of images, have just jumped back"
+            return None, 0
         try:
             found = self._buffer.lookup_transform(self._table_frame, camera_frame, stamp)
-        except tf2_ros.TransformException:
+        except tf2_ros.TransformException as error:
+            self._failure = " ".join(str(error).split())
+            if isinstance(error, tf2_ros.ExtrapolationException):
+                self._connected.add(camera_frame)
             return None, 0
+        self._connected.add(camera_frame)
         p, q = found.transform.translation, found.transform.rotation
         try:
             pose = matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
-        except ValueError:
+        except ValueError as error:
+            self._failure = str(error)
             return None, 0
         return pose, stamp_to_ns(found.header.stamp)
+
+
+def _time(stamp_ns: int) -> Time:
+    """A stamp for tf2, to which 0 means the newest transform, whatever its age, and which knows no negative ones."""
+    return Time(nanoseconds=max(stamp_ns, 1))

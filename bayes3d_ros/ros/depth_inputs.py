@@ -50,6 +50,7 @@ class DepthInputs:
         self._delivered_at: float | None = None
         self._depth_at: float | None = None
         self._info_at: float | None = None
+        self._next_poll = 0.0
         self._pose_used = NO_POSE
         reliability = settings.qos_reliability
         self._poses: CameraPoseSource | None = None
@@ -63,7 +64,7 @@ class DepthInputs:
                 max_gap=settings.pose_max_gap,
                 tolerance=settings.pose_tolerance,
                 required=use_pose == "required",
-                on_pose=self._take,
+                on_pose=self._on_pose,
             )
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
         self._node = node
@@ -126,8 +127,17 @@ class DepthInputs:
 
     def _poll(self) -> None:
         """What has waited too long goes on without; tf is asked anew."""
+        began = time.monotonic()
+        if began < self._next_poll:
+            return
         if self._poses is not None:
             self._poses.poll()
+        self._on_pose()
+        # With many images this takes a while, and must not take all of it: messages wait meanwhile.
+        self._next_poll = began + 10 * (time.monotonic() - began)
+
+    def _on_pose(self) -> None:
+        self._queue.poses_changed()
         self._take()
 
     def _on_image(self, image: Image, latched: bool) -> None:
@@ -135,7 +145,7 @@ class DepthInputs:
         self.received += 1
         stamp_ns = stamp_to_ns(image.header.stamp)
         if self._queue.add_image(stamp_ns, image, len(image.data), self._depth_at) and self._poses is not None:
-            self._poses.images_jumped()
+            self._poses.images_jumped(stamp_ns)
         self._take()
 
     def _on_info(self, info: CameraInfo, latched: bool) -> None:

@@ -21,6 +21,11 @@ _MOST_REMEMBERED = 1024  # CameraInfo messages, and arrivals of images
 FindPose = Callable[[int, ImageT, bool], PoseT | None]
 
 
+class _Arrival(NamedTuple):
+    number: int  # counts images
+    time: float
+
+
 class Complete(NamedTuple, Generic[ImageT, InfoT, PoseT]):
     """An image with all that belongs to it. `exact`: its CameraInfo has the image's stamp."""
 
@@ -31,12 +36,13 @@ class Complete(NamedTuple, Generic[ImageT, InfoT, PoseT]):
     arrived: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Waiting(Generic[ImageT]):
     order: tuple[int, int]  # the number of backward jumps before it, then its stamp
     image: ImageT
     size: int
     arrived: float
+    asked: int = -1  # what was known of poses when its own was last asked for
 
     @property
     def stamp_ns(self) -> int:
@@ -52,7 +58,7 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
 
     Drivers exist that stamp CameraInfo differently or send it once, and intrinsics hardly ever change. So an image
     whose CameraInfo has not come in time takes the latest one. So do all after it, without waiting, until CameraInfo
-    with the stamps of images comes in time again.
+    with the stamps of two images in a row comes in time.
 
     Times are seconds of a steady clock, and are the caller's. No call takes long, and none waits.
     """
@@ -65,7 +71,9 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         self._bytes = 0
         self._infos: OrderedDict[int, tuple[InfoT, float]] = OrderedDict()  # with its arrival, by stamp
         self._latest: InfoT | None = None
-        self._arrivals: OrderedDict[int, float] = OrderedDict()  # of images, by stamp
+        self._arrivals: OrderedDict[int, _Arrival] = OrderedDict()  # of images, by stamp
+        self._received, self._matched = 0, -1  # the number of images, and of the last that CameraInfo came for in time
+        self._poses_known = 0
         self._jumps = 0
         self._newest: int | None = None  # stamp since the last jump
         self._seen: OrderedDict[int, None] = OrderedDict()  # stamps since the last jump, of the last second
@@ -94,7 +102,9 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         self._seen[stamp_ns] = None
         while self._seen and next(iter(self._seen)) <= self._newest - JUMP_NS:
             self._seen.popitem(last=False)
-        _remember(self._arrivals, stamp_ns, now)
+        _remember(self._arrivals, stamp_ns, _Arrival(self._received, now))
+        self._received += 1
+        self._compare(stamp_ns)
         order = (self._jumps, stamp_ns)
         if order < self._handed_out or (self._images and self._bytes + size > self._most_bytes):
             # Without room the images that wait go first: their turn comes within `patience`, and makes room.
@@ -108,8 +118,11 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         """A CameraInfo that arrived at `now`."""
         self._latest = info
         _remember(self._infos, stamp_ns, (info, now))
-        if stamp_ns in self._arrivals and now - self._arrivals[stamp_ns] < self._patience:
-            self.stamps_agree = True
+        self._compare(stamp_ns)
+
+    def poses_changed(self) -> None:
+        """Poses may be known now that were not: the next `take` asks for those of all images that wait."""
+        self._poses_known += 1
 
     def take(self, now: float) -> Complete[ImageT, InfoT, PoseT] | None:
         """The newest complete image, if there is one; what arrived before it is dropped."""
@@ -122,15 +135,17 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
             own = self._infos.get(waiting.stamp_ns)
             if own is None and self.stamps_agree:
                 continue
-            pose = self._find_pose(waiting.stamp_ns, waiting.image, self._due(waiting, now))
+            due = self._due(waiting, now)
+            if waiting.asked == self._poses_known and not due:
+                continue
+            waiting.asked = self._poses_known
+            pose = self._find_pose(waiting.stamp_ns, waiting.image, due)
             if pose is None:
                 continue
             self._hand_out(waiting)
             if own is None:
                 return Complete(waiting.image, self._latest, False, pose, waiting.arrived)
-            info, info_arrived = own
-            self.stamps_agree |= now - info_arrived < self._patience  # one of long ago has the stamp by chance
-            return Complete(waiting.image, info, True, pose, waiting.arrived)
+            return Complete(waiting.image, own[0], True, pose, waiting.arrived)
         return None
 
     def clear(self) -> None:
@@ -138,6 +153,15 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         self.dropped += len(self._images)
         self._images.clear()
         self._bytes = 0
+
+    def _compare(self, stamp_ns: int) -> None:
+        """See whether an image and CameraInfo of this stamp came within `patience` of each other. That may be by chance
+        for one image, and not for two in a row."""
+        if stamp_ns in self._arrivals and stamp_ns in self._infos:
+            number, arrived = self._arrivals[stamp_ns]
+            if abs(self._infos[stamp_ns][1] - arrived) < self._patience:
+                self.stamps_agree |= number == self._matched + 1
+                self._matched = number
 
     def _due(self, waiting: _Waiting[ImageT], now: float) -> bool:
         return now - waiting.arrived >= self._patience

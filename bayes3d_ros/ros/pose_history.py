@@ -12,7 +12,8 @@ from bayes3d_ros.ros.input_queue import JUMP_NS
 Matrix = Float[np.ndarray, "4 4"]
 
 _MOST = 20_000  # poses
-_STREAM = 1.0  # seconds: latched poses that change faster than this belong to a camera that moves
+_STREAM_NS = 1_000_000_000  # between the stamps of latched poses that change because the camera moves
+_STREAM = 3  # such poses in a row
 
 
 class Nearest(NamedTuple):
@@ -25,15 +26,15 @@ class Nearest(NamedTuple):
 class _Latched(NamedTuple):
     stamp_ns: int
     pose: Matrix
-    arrived: float
+    streak: int  # poses that followed each other quickly, up to this one
 
 
 class PoseHistory:
     """T_table_camera by stamp, for `keep` seconds.
 
     `static` is a pose that holds for any stamp: the last one with stamp 0, or the last one of a latched
-    (transient_local) publisher. Any other pose that comes later replaces it. `moving` says that latched poses follow
-    each other too quickly for a camera at rest.
+    (transient_local) publisher. Any other pose that comes later replaces it. Latched poses that follow each other
+    quickly are of a camera that moves, and none of them is static.
     """
 
     def __init__(self, max_gap: float, keep: float) -> None:
@@ -42,7 +43,6 @@ class PoseHistory:
         self._poses: dict[int, tuple[Matrix, float]] = {}  # the pose, and when it arrived
         self._latched: _Latched | None = None
         self._static: Matrix | None = None
-        self.moving = False
 
     @property
     def static(self) -> Matrix | None:
@@ -58,9 +58,9 @@ class PoseHistory:
         """A pose that arrived at `now` (steady seconds). A latched publisher's poses may come twice, as latched and
         not; the copy says nothing."""
         if latched:
-            self._add_latched(stamp_ns, pose, now)
+            self._add_latched(stamp_ns, pose)
         elif stamp_ns == 0:
-            self._static, self.moving = pose, False
+            self._static = pose
         elif not self._is_copy(stamp_ns, pose):
             self._static = None
         if stamp_ns != 0:
@@ -87,9 +87,10 @@ class PoseHistory:
         near = min(self._stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp_ns))
         return Nearest(self._poses[near][0], 1e-9 * (near - stamp_ns))
 
-    def forget_before(self, arrived: float) -> None:
-        """Forget the poses with a stamp that arrived before this time: they are of before a jump of the clock."""
-        self._keep_only([s for s in self._stamps if self._poses[s][1] >= arrived])
+    def jumped_back(self, stamp_ns: int, now: float) -> None:
+        """Stamps have gone back to this one: forget poses of before. They arrived longer ago, or have later stamps."""
+        last, first = stamp_ns + JUMP_NS, now - 1e-9 * JUMP_NS
+        self._keep_only([s for s in self._stamps if s < last and self._poses[s][1] >= first])
 
     def _is_copy(self, stamp_ns: int, pose: Matrix) -> bool:
         """Whether this is a latched pose that came before."""
@@ -100,13 +101,12 @@ class PoseHistory:
         known = self._poses.get(stamp_ns)
         return np.full((4, 4), np.nan) if known is None else known[0]
 
-    def _add_latched(self, stamp_ns: int, pose: Matrix, now: float) -> None:
-        before = self._latched
-        if before is None or not np.array_equal(before.pose, pose):
-            self.moving = before is not None and now - before.arrived < _STREAM
-        elif now - before.arrived >= _STREAM:
-            self.moving = False
-        self._latched, self._static = _Latched(stamp_ns, pose, now), pose
+    def _add_latched(self, stamp_ns: int, pose: Matrix) -> None:
+        before, streak = self._latched, 1
+        if before is not None and not np.array_equal(before.pose, pose):
+            streak += before.streak * (abs(stamp_ns - before.stamp_ns) < _STREAM_NS)
+        self._latched = _Latched(stamp_ns, pose, streak)
+        self._static = pose if streak < _STREAM else None
 
     def _insert(self, stamp_ns: int, pose: Matrix, now: float) -> None:
         if self._stamps and stamp_ns <= self._stamps[-1] - JUMP_NS:

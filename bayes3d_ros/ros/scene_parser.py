@@ -202,7 +202,8 @@ class SceneParserNode(Node):
         return self._settings.check(parameters)
 
     def _after_set_parameters(self, parameters: list[Parameter]) -> None:
-        if self._ready is not None and any(p.name in _PARSER_PARAMETERS for p in parameters):
+        begun = self._ready is not None or self._preparing_since is not None
+        if begun and any(p.name in _PARSER_PARAMETERS for p in parameters):
             self._prepare()
         if self._inputs is not None and any(p.name in (*INPUT_PARAMETERS, "table") for p in parameters):
             self._close_inputs()

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from bayes3d_ros.ros.transport import use_large_messages
 
 _PATIENCE = 0.3  # seconds that a frame may still take when a node is told to stop
+_AGAIN = 0.5  # seconds after which an interrupt that had no effect is raised again
 
 
 class StoppableNode(Protocol):
@@ -52,15 +53,23 @@ def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -
 @contextmanager
 def until_stopped() -> Iterator[None]:
     """Work that SIGINT, SIGTERM or a shutdown of ROS ends, without an exception. SIGINT is ignored from then on: launch
-    and a terminal both send one for the same Ctrl-C, and the second must not cut the clean end short."""
+    and a terminal both send one for the same Ctrl-C, and the second must not cut the clean end short.
+
+    An exception is lost where Python has nobody to hand it to, as in JAX's callback of the garbage collector; so it is
+    raised again until the work has ended."""
     ended = False
 
     def interrupt(number: int, frame: object) -> None:
         nonlocal ended
         if not ended:
             ended = True
-            raise KeyboardInterrupt
+            again(number, frame)
 
+    def again(number: int, frame: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGALRM, again)
     signal.signal(signal.SIGINT, interrupt)
     try:
         yield
@@ -73,6 +82,7 @@ def until_stopped() -> Iterator[None]:
             raise
     finally:
         ended = True
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -82,7 +82,16 @@ class AutoSubscription:
         )
 
     def _hear(self, latched: bool, message: Any) -> None:
-        self._callback(message, latched)
+        try:
+            self._callback(message, latched)
+        except Exception as error:  # a node must not die of a message
+            if not self._node.context.ok():
+                raise
+            told = " ".join(str(error).split())
+            self._node.get_logger().error(
+                f"{self.topic}: internal error, please report it: {type(error).__name__}: {told}",
+                throttle_duration_sec=10.0,
+            )
 
     def _on_incompatible(self, latched: bool, event: QoSRequestedIncompatibleQoSInfo) -> None:
         if latched and event.last_policy_kind == QoSPolicyKind.DURABILITY:

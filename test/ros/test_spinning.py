@@ -1,6 +1,8 @@
 """Signals end a node without an exception, whenever they come."""
 
+import contextlib
 import signal
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -56,3 +58,19 @@ def test_a_signal_may_come_out_of_rclpy_as_another_exception(monkeypatch, runnin
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
         raise RuntimeError("taking a message failed")
+
+
+def test_an_interrupt_that_is_lost_is_raised_again() -> None:
+    with spinning.until_stopped():
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        threading.Event().wait(10)
+        pytest.fail("the work was not ended")
+
+
+def test_ctrl_c_while_a_node_imports_ends_it(ros) -> None:
+    program = "from bayes3d_ros.ros import entry; print('began', flush=True); entry.scene_parser()"
+    process = ros.start("-c", program)
+    ros.wait_for(lambda: "began" in process.output(), "the beginning")
+    assert process.stop(signal.SIGINT) == 0
+    assert process.output() == "began\n"
