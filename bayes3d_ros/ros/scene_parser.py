@@ -118,6 +118,12 @@ class SceneParserNode(Node):
         """Stop the worker; False if it is in the middle of something longer than `timeout` seconds."""
         return self._worker.stop(timeout)
 
+    def destroy_node(self) -> None:
+        """Destroy the node, at once. rclpy leaves the lifecycle's part, which holds the DDS participant for as long as
+        anything, such as a worker that compiles, refers to this object."""
+        super().destroy_node()
+        self._state_machine = None
+
     # Preparing a parser
 
     def _load(self) -> tuple[Library, ParserSettings]:

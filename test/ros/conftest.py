@@ -1,7 +1,6 @@
 """Nodes in processes of their own, over real DDS, on a domain that nobody else on this machine uses."""
 
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -52,7 +51,7 @@ class Ros:
 
     def kill(self, process: NodeProcess) -> None:
         """kill -9, as part of a test."""
-        process.stop(signal.SIGKILL)
+        process.kill()
         self._processes.remove(process)
 
     def start_parser(self, library: Path | str, *arguments: str, **parameters: Any) -> NodeProcess:
@@ -124,7 +123,7 @@ class Ros:
 
     def close(self) -> None:
         for process in self._processes:
-            process.stop(signal.SIGKILL)
+            process.kill()
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)

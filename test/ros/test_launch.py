@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from bayes3d_ros.bags import BagWriter, raw_messages
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.conversions import stamp_to_ns
-from bayes3d_ros.ros.processes import NodeProcess
+from bayes3d_ros.ros.processes import NodeProcess, kill
 
 pytest.importorskip("launch_ros", reason="launch comes with an installed ROS, and not from PyPI")
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
@@ -54,7 +54,7 @@ def start(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Star
     for launch in launches:
         for pid in pids(launch).values():
             if alive(pid):
-                os.kill(pid, signal.SIGKILL)
+                kill(pid)
 
 
 def install(folder: Path, package: str, commands: dict) -> None:
@@ -89,7 +89,7 @@ def wait_until_gone(*processes: int, seconds: float = 20.0) -> None:
     while left := [pid for pid in processes if alive(pid)]:
         if time.monotonic() > deadline:
             for pid in left:
-                os.kill(pid, signal.SIGKILL)
+                kill(pid)
             pytest.fail(f"{len(left)} of {len(processes)} processes were left behind")
         time.sleep(0.1)
 
@@ -216,7 +216,7 @@ def test_the_player_ends_with_the_node(ros, start: Start, tmp_path: Path, depth_
     launch = start("scene_parser", *words)  # without a library it subscribes to nothing, and the player waits
     ros.wait_for_diagnosis(ros.listen(DiagnosticArray, "/diagnostics"), "parameter library is not set")
     started = pids(launch)
-    os.kill(started["scene_parser"], signal.SIGKILL)
+    kill(started["scene_parser"])
     wait_until_gone(*started.values())
     ros.wait_for(lambda: launch.status is not None, "the end of launch")
 

@@ -16,6 +16,7 @@ from bayes3d_ros.bags import BagWriter
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.processes import shared_memory
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
@@ -120,5 +121,7 @@ def test_every_end_is_a_clean_one(ros, library_folder: Path, signals: tuple[int,
         ros.wait_for_diagnosis(diagnostics, "parsing")
     else:
         ros.wait_for_diagnosis(diagnostics, "no publisher")
+    memory = shared_memory(parser.pid)
     assert parser.stop(*signals) == 0, parser.output()
     assert "Traceback" not in parser.output()
+    assert memory and not [path for path in memory if path.exists()], "shared memory of DDS is left behind"
