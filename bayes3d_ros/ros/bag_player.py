@@ -18,7 +18,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.bags import BagDamage, BagError, RawMessage, raw_messages, topics
-from bayes3d_ros.ros.names import played
+from bayes3d_ros.ros.names import full_name, played
 from bayes3d_ros.ros.spinning import shut_down, until_stopped
 from bayes3d_ros.ros.transport import use_large_messages
 
@@ -80,7 +80,7 @@ class BagPlayer(Node):
         """Whether a node subscribes to a topic of the bag."""
         topics = [publisher.topic_name for publisher in self.publishers_of.values()]
         ends = [end for topic in topics for end in self.get_subscriptions_info_by_topic(topic)]
-        return any(f"{end.node_namespace.rstrip('/')}/{end.node_name}" == node for end in ends)
+        return any(full_name(end.node_namespace, end.node_name) == node for end in ends)
 
     def _spin(self, seconds: float) -> None:
         """Answer parameter services and the like for so long."""

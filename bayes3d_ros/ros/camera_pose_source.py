@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from bayes3d_ros.ros.conversions import matrix_from_values, pose_to_matrix, stamp_to_ns
+from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 
@@ -45,7 +46,8 @@ class CameraPoseSource:
     """The camera's pose for the stamps of images.
 
     Topic and tf: the pose of the stamp, or one interpolated between its neighbours; on the topic these may be at most
-    `max_gap` seconds apart. When an image has waited long enough: the nearest pose, at most `tolerance` seconds away.
+    `pose_max_gap` seconds apart. When an image has waited long enough: the nearest pose, at most `pose_tolerance`
+    seconds away.
     Nothing is extrapolated, and a pose is not used for other stamps, unless it is static: of stamp 0, of a latched
     publisher, of /tf_static, or the parameter's, which counts only where neither the topic nor tf is in use.
 
@@ -55,25 +57,25 @@ class CameraPoseSource:
     def __init__(
         self,
         node: Node,
-        *,
-        table_frame: str,
-        fixed_pose: tuple[float, ...],
-        reliability: str,
-        patience: float,
-        max_gap: float,
-        tolerance: float,
+        settings: DepthInputSettings,
         required: bool,
         on_pose: Callable[[], None],
     ) -> None:
-        self._table_frame, self._tolerance, self._on_new = table_frame, tolerance, on_pose
-        self._fixed = matrix_from_values(list(fixed_pose)) if fixed_pose else None
+        self._table_frame, self._tolerance, self._on_new = settings.table_frame, settings.pose_tolerance, on_pose
+        self._fixed = matrix_from_values(list(settings.camera_pose)) if settings.camera_pose else None
         self._required = required and self._fixed is None
-        self._history = PoseHistory(max_gap, patience + _HISTORY)
+        self._history = PoseHistory(settings.pose_max_gap, settings.patience + _HISTORY)
         self.refused = ""  # what is wrong with the newest message on the topic
         self._topic = AutoSubscription(
-            node, PoseStamped, "camera_pose", self._on_pose, reliability=reliability, depth=100, latched=True
+            node,
+            PoseStamped,
+            "camera_pose",
+            self._on_pose,
+            reliability=settings.qos_reliability,
+            depth=100,
+            latched=True,
         )
-        self._tf = None if tf2_ros is None else _Tf(node, table_frame)
+        self._tf = None if tf2_ros is None else _Tf(node, settings.table_frame)
 
     @property
     def topic(self) -> str:

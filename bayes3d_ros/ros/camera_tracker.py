@@ -34,7 +34,7 @@ from bayes3d_ros.model.world_file import load_world
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, Health, InputView, judge, one_line
+from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT, Health, InputView, judge, one_line
 from bayes3d_ros.ros.parameters import (
     CAMERA_TRACKER_SETTINGS,
     CameraTrackerNodeSettings,
@@ -186,7 +186,9 @@ class CameraTrackerNode(Node):
         what = "looking at the first frame" if self._known is None else "tracking one frame"
         if follower.compiled_for(width, height, self._known):
             return self._health.doing(what, usual=QUIET)
-        self.get_logger().info(f"compiling for images of {width}x{height}; a minute or two the first time")
+        # Part of it waits until a world is seen, so that this may be said of several frames.
+        told = f"compiling for images of {width}x{height}; a minute or two the first time"
+        self.get_logger().info(told, throttle_duration_sec=REPEAT)
         return self._health.doing(f"compiling for images of {width}x{height} and {what}")
 
     def _worker_failed(self, error: Exception) -> None:

@@ -52,24 +52,14 @@ class DepthInputs:
         self._info_at: float | None = None
         self._next_poll = 0.0
         self._pose_used = NO_POSE
-        reliability = settings.qos_reliability
         self._poses: CameraPoseSource | None = None
         if use_pose != "no":
-            self._poses = CameraPoseSource(
-                node,
-                table_frame=settings.table_frame,
-                fixed_pose=settings.camera_pose,
-                reliability=reliability,
-                patience=settings.patience,
-                max_gap=settings.pose_max_gap,
-                tolerance=settings.pose_tolerance,
-                required=use_pose == "required",
-                on_pose=self._on_pose,
-            )
+            self._poses = CameraPoseSource(node, settings, use_pose == "required", self._on_pose)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
         self._node = node
         self._looking = node.create_timer(_LOOK, self._look, clock=steady)
         self._polling = node.create_timer(_POLL, self._poll, clock=steady)
+        reliability = settings.qos_reliability
         self._image_topic = AutoSubscription(
             node, Image, DEPTH_TOPIC, self._on_image, reliability=reliability, depth=10
         )

@@ -86,11 +86,6 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         """How many images wait."""
         return len(self._images)
 
-    @property
-    def has_info(self) -> bool:
-        """Whether any CameraInfo has come."""
-        return self._latest is not None
-
     def add_image(self, stamp_ns: int, image: ImageT, size: int, now: float) -> bool:
         """An image of `size` bytes that arrived at `now`; whether its stamp jumped back by a second or more."""
         jumped_far = self._newest is not None and stamp_ns <= self._newest - JUMP_NS

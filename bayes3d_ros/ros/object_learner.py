@@ -163,10 +163,12 @@ class ObjectLearnerNode(Node):
     def _may_replace(self, name: str, captured: set[int]) -> bool:
         """Whether a model may be written over: where `replace` says so, or where it was learned from views that are all
         among the captures (stamps), so that nothing is lost. Raises LibraryError for another one."""
+        if self._node_settings().replace:
+            return True
         library = self._library()
         path = model_path(library, name)
         before = learned_from(load_model(path)) if path.exists() else set()
-        if self._node_settings().replace or (before and before <= captured):
+        if before and before <= captured:
             return True
         refuse_existing(library, name)
         return False

@@ -49,11 +49,6 @@ class PoseHistory:
         """The pose for any stamp, or None."""
         return self._static
 
-    @property
-    def empty(self) -> bool:
-        """Whether there is no pose with a stamp."""
-        return not self._stamps
-
     def add(self, stamp_ns: int, pose: Matrix, now: float, latched: bool) -> None:
         """A pose that arrived at `now` (steady seconds). A latched publisher's poses may come twice, as latched and
         not; the copy says nothing."""

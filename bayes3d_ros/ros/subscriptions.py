@@ -10,6 +10,9 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from bayes3d_ros.ros.diagnostics import REPEAT
+from bayes3d_ros.ros.names import full_name
+
 
 class AutoSubscription:
     """Calls `callback(message, latched)` for every message of a topic.
@@ -49,7 +52,7 @@ class AutoSubscription:
     @property
     def publishers(self) -> tuple[str, ...]:
         """The nodes that publish on the topic, as /namespace/name, one entry a publisher, as of the last look."""
-        return tuple(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in self._publishers)
+        return tuple(full_name(p.node_namespace, p.node_name) for p in self._publishers)
 
     def look(self) -> None:
         """Look at who publishes, and subscribe as that needs; to be called a few times a second."""
@@ -90,7 +93,7 @@ class AutoSubscription:
             told = " ".join(str(error).split())
             self._node.get_logger().error(
                 f"{self.topic}: internal error, please report it: {type(error).__name__}: {told}",
-                throttle_duration_sec=10.0,
+                throttle_duration_sec=REPEAT,
             )
 
     def _on_incompatible(self, latched: bool, event: QoSRequestedIncompatibleQoSInfo) -> None:

@@ -51,7 +51,7 @@ PAPER: dict[str, dict[int, tuple[float, float, float]]] = {
         25: (104.2, 0.650, 3.710), 50: (84.0, 0.392, 1.980), 100: (37.5, 0.240, 1.157), 200: (14.3, 0.254, 1.281)
     },
 }  # fmt: skip
-# What issue 6 asks for, in cm and degrees: own frames, the paper's or this; independent ones from 100 pixels on.
+# What the tracker must keep to, cm and degrees: own frames, the paper's or this; independent ones from 100 pixels on.
 OWN_POSITION, INDEPENDENT = 0.01, (0.3, 1.5)
 NOISELESS = 0.0005  # metres: sigma_max where frames have no noise
 HEADER = (

@@ -34,7 +34,7 @@ SEEDS, QUICK_SEEDS = 50, 8
 QUICK_PROBLEMS = ("handle seen", "handle hidden")
 QUANTITIES = ("type", "face", "yaw")  # whose distributions are compared
 PLACES, SHARES = ("x", "y", "yaw"), (0.5, 0.9)  # whose regions are
-# What a problem's summary must keep to (issue 4): at most, and runs within their limit at least.
+# What a problem's summary must keep to: at most, and runs within their limit at least.
 MOVES, ERRORS_OFF, RMS_LOG, TV, WIDTH, WITHIN = 0.02, 3.0, 0.3, 0.1, 1.2, 1.0
 HEADER = (
     f"{'problem':<14} {'seed':>5} {'log Z':>9} {'- exact':>8} {'ESS':>6}   "

@@ -25,7 +25,7 @@ from bayes3d_ros.model.posterior import ObjectEstimate, ScenePosterior
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
 SEEDS = (0, 1)
-# What issue 4 asks for: effective share of the particles, standard deviations, probability.
+# What two runs of a frame must keep to: effective share of the particles, standard deviations, probability.
 LEAST_ESS, APART, TYPE_APART = 0.1, 1.0, 0.05
 HEADER = (
     f"{'recording':<18} {'frame':>20}  {'means apart':>11} {'poses apart':>11} {'p(type)':>8} {'p(n)':>6}"
