@@ -66,7 +66,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "bayes3d = bayes3d_ros.cli:main",
+            "bayes3d = bayes3d_ros.cli.main:main",
             "scene_parser = bayes3d_ros.ros.entry:scene_parser",
             "object_learner = bayes3d_ros.ros.entry:object_learner",
             "camera_tracker = bayes3d_ros.ros.entry:camera_tracker",

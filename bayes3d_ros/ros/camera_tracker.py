@@ -21,16 +21,11 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.inference.camera_following import CameraFollower
-from bayes3d_ros.inference.camera_tracking import CameraTracker, Tracking
-from bayes3d_ros.inference.compilation import enable_cache, every_core
-from bayes3d_ros.inference.scene_parsing import SceneParser
-from bayes3d_ros.inference.settings import TrackerSettings
-from bayes3d_ros.model.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
-from bayes3d_ros.model.objects import Library, LibraryError, load_library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ParseError
-from bayes3d_ros.model.world_file import load_world
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.jax_runtime import enable_cache, every_core
+from bayes3d_ros.objects.model import Library, LibraryError, load_library
+from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
@@ -43,6 +38,11 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
+from bayes3d_ros.settings import TrackerSettings
+from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
+from bayes3d_ros.tracking.session import CameraFollower
+from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
+from bayes3d_ros.tracking.world_file import load_world
 
 _RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 _TRACKER_PARAMETERS = ("library", "world", *(f.name for f in fields(TrackerSettings)))
@@ -52,7 +52,7 @@ _PURPOSE = "Depth images in, where the camera is in the world that it first saw 
 
 
 class Follower(Protocol):
-    """What the node needs of a tracker; see inference/camera_following.py."""
+    """What the node needs of a tracker; see tracking/session.py."""
 
     def compiled_for(self, width: int, height: int, known: Tracking | None) -> bool: ...
 

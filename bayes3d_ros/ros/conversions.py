@@ -12,12 +12,12 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header, String
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
 from bayes3d_ros.geometry.poses import pose_matrix
-from bayes3d_ros.model.camera_estimate import CameraEstimate
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ScenePosterior
-from bayes3d_ros.model.summaries import posterior_rows
+from bayes3d_ros.posterior.summarise import posterior_rows
+from bayes3d_ros.posterior.types import ScenePosterior
+from bayes3d_ros.tracking.camera_estimate import CameraEstimate
 
 _POINT_TYPE = {np.dtype(np.float32): PointField.FLOAT32, np.dtype(np.int32): PointField.INT32}
 
@@ -142,7 +142,7 @@ def reconstruction_image(posterior: ScenePosterior) -> Image:
 
 
 def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
-    """A point per object per sample; a sample without objects is one point with object = -1 (model/summaries.py)."""
+    """A point per object per sample; a sample without objects is one point with object = -1 (`posterior_rows`)."""
     return cloud_message(posterior_rows(posterior.samples, posterior.object_index), header(posterior))
 
 

@@ -19,19 +19,19 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation.metrics import add_s
-from bayes3d_ros.evaluation.plots import plot_scene
-from bayes3d_ros.model.mesh_import import import_meshes
-from bayes3d_ros.model.objects import Library, load_library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.io.bags import read_frames
+from bayes3d_ros.io.plots import plot_scene
+from bayes3d_ros.objects.mesh_import import import_meshes
+from bayes3d_ros.objects.model import Library, load_library
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.conversions import matrix_from_values
 from bayes3d_ros.ros.detections import detections_type
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
 from bayes3d_ros.ros.spinning import shut_down
+from bayes3d_ros.validation.statistics.metrics import add_s
 
 MESHES = (
     *("003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "010_potted_meat_can"),

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.posterior import ScenePosterior
-from bayes3d_ros.model.summaries import modes_by_type
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.posterior.summarise import modes_by_type
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.conversions import header, matrix_from_values, matrix_to_pose, pose_message
 
 try:

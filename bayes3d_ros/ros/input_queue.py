@@ -63,9 +63,7 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
     Times are seconds of a steady clock, and are the caller's. No call takes long, and none waits.
     """
 
-    def __init__(
-        self, patience: float, find_pose: FindPose[ImageT, PoseT], most_bytes: int = MOST_BYTES
-    ) -> None:
+    def __init__(self, patience: float, find_pose: FindPose[ImageT, PoseT], most_bytes: int = MOST_BYTES) -> None:
         self._patience, self._find_pose, self._most_bytes = patience, find_pose, most_bytes
         self._images: dict[tuple[int, int], _Waiting[ImageT]] = {}
         self._bytes = 0

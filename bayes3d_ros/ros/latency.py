@@ -13,13 +13,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation.benchmark import TEN_TYPES, Case, line, parsing_row, ycb_library
-from bayes3d_ros.evaluation.speed_rows import SpeedRow
+from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 from bayes3d_ros.ros.received import stamp_of
 from bayes3d_ros.ros.spinning import shut_down
+from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, Case, line, parsing_row, ycb_library
+from bayes3d_ros.validation.bench.speed_rows import SpeedRow
 
 __all__ = ["HEADER", "count", "line", "node_row", "rows"]
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bayes3d_ros.model.objects import Library, ObjectModel
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.objects.model import Library, ObjectModel
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.conversions import header, pose_message
 
 _TEXT_HEIGHT = 0.02  # metres

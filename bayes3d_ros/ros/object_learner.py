@@ -18,8 +18,9 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.captures import CaptureError, CaptureStore
-from bayes3d_ros.inference.object_learning import (
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.io.captures import CaptureError, CaptureStore
+from bayes3d_ros.learning.learn import (
     MOST_VIEWS,
     Learned,
     LearningError,
@@ -27,10 +28,8 @@ from bayes3d_ros.inference.object_learning import (
     learn,
     new_share,
 )
-from bayes3d_ros.inference.settings import LearnerSettings
-from bayes3d_ros.inference.view_segmentation import Thing, ViewError, segment
-from bayes3d_ros.model.objects import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.learning.segment import Thing, ViewError, segment
+from bayes3d_ros.objects.model import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
@@ -54,6 +53,7 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.summary import key_values
+from bayes3d_ros.settings import LearnerSettings
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _INPUTS = tuple(f.name for f in fields(DepthInputSettings))

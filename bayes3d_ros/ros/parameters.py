@@ -13,9 +13,9 @@ from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeExce
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bayes3d_ros.inference.object_learning import LearningError, check_name
-from bayes3d_ros.inference.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
+from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.conversions import matrix_from_values
+from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 
 Settings = TypeVar("Settings")
 

@@ -5,15 +5,15 @@ from typing import NamedTuple, Protocol
 
 import jax
 
-from bayes3d_ros.inference.settings import ParserSettings
-from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.markers import SceneMarkers
+from bayes3d_ros.settings import ParserSettings
 
 
 class Parser(Protocol):
-    """What a node needs of a parser; see inference/scene_parsing.py."""
+    """What a node needs of a parser; see parsing/parser.py."""
 
     library: Library
     settings: ParserSettings

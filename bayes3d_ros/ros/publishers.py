@@ -10,8 +10,8 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.posterior import ScenePosterior
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.detections import detection_array, detections_type
 from bayes3d_ros.ros.markers import SceneMarkers

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import Image
 
-from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
-from bayes3d_ros.model.summaries import object_estimates
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.posterior.summarise import object_estimates
+from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
 from bayes3d_ros.ros.conversions import depth_from_image, rows_from_cloud, stamp_to_ns
 
 

@@ -15,12 +15,11 @@ from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.inference.compilation import enable_cache
-from bayes3d_ros.inference.scene_parsing import SceneParser
-from bayes3d_ros.inference.settings import ParserSettings
-from bayes3d_ros.model.objects import Library, LibraryError, load_library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ParseError, usable_note
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.jax_runtime import enable_cache
+from bayes3d_ros.objects.model import Library, LibraryError, load_library
+from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.types import ParseError, usable_note
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
@@ -36,6 +35,7 @@ from bayes3d_ros.ros.prepared import MakeParser, Prepared, prepare
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.worker import NewestWorker
+from bayes3d_ros.settings import ParserSettings
 
 _PARSER_PARAMETERS = tuple(f.name for f in fields(ParserSettings))
 

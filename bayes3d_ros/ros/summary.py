@@ -3,7 +3,7 @@
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from bayes3d_ros.model.posterior import ObjectEstimate, PoseMode, ScenePosterior
+from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
 from bayes3d_ros.ros.conversions import header
 
 

@@ -20,7 +20,7 @@ from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from bayes3d_ros.model.camera_estimate import CameraEstimate, TrackingError
 from bayes3d_ros.ros.camera_tracker import CameraTrackerNode
 from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.tracking.camera_estimate import CameraEstimate, TrackingError
 
 
 class FakeFollower:

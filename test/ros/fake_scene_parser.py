@@ -6,12 +6,12 @@ import threading
 
 import numpy as np
 
-from bayes3d_ros.inference.settings import ParserSettings
-from bayes3d_ros.model.objects import Library
-from bayes3d_ros.model.observation import DepthFrame
-from bayes3d_ros.model.posterior import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.ros.scene_parser import SceneParserNode
 from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.settings import ParserSettings
 
 
 class FakeParser:

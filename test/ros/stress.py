@@ -1,7 +1,7 @@
 """Long and hostile runs of a scene_parser process, too long for the suite.
 
-    python test/ros/stress.py soak --library FOLDER [--minutes 10]    30 images a second of 640x480: memory, counts
-    python test/ros/stress.py fuzz [--messages 10000]                 wrong and extreme messages to all three nodes
+python test/ros/stress.py soak --library FOLDER [--minutes 10]    30 images a second of 640x480: memory, counts
+python test/ros/stress.py fuzz [--messages 10000]                 wrong and extreme messages to all three nodes
 """
 
 import argparse
@@ -22,8 +22,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import CameraInfo, Image
 
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.processes import NodeProcess
 

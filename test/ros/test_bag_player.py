@@ -6,7 +6,7 @@ from rcl_interfaces.srv import ListParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
-from bayes3d_ros.bags import BagWriter
+from bayes3d_ros.io.bags import BagWriter
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.bag_player import main, message_class
 

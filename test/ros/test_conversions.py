@@ -10,8 +10,8 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from bayes3d_ros.geometry.depth_image import encode_depth
-from bayes3d_ros.model.posterior import ScenePosterior, SceneSamples
-from bayes3d_ros.model.summaries import POSTERIOR_FIELDS, summarise
+from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
+from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
 from bayes3d_ros.ros import conversions, detections
 from bayes3d_ros.ros.markers import SceneMarkers, ellipsoid
 from bayes3d_ros.ros.summary import summary_message

@@ -12,12 +12,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.evaluation.benchmark import Case
+from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import latency
 from bayes3d_ros.ros.conversions import ns_to_stamp
 from bayes3d_ros.ros.latency import LatencyError
+from bayes3d_ros.validation.bench.benchmark import Case
 
 BAG = share_directory() / "bags" / "one_object"
 

@@ -16,7 +16,7 @@ from rcl_interfaces.srv import GetParameters
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bayes3d_ros.bags import BagWriter, raw_messages
+from bayes3d_ros.io.bags import BagWriter, raw_messages
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.conversions import stamp_to_ns
 from bayes3d_ros.ros.processes import NodeProcess, kill

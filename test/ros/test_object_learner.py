@@ -17,10 +17,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.bags import read_frames
-from bayes3d_ros.model.mesh_import import model_from_mesh
-from bayes3d_ros.model.objects import load_library, save_model
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.io.bags import read_frames
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import load_library, save_model
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import conversions
 

@@ -8,7 +8,6 @@ import yaml
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bayes3d_ros.inference.settings import ParserSettings
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.parameters import (
     NODE_SETTINGS,
@@ -19,6 +18,7 @@ from bayes3d_ros.ros.parameters import (
     describe,
     yaml_text,
 )
+from bayes3d_ros.settings import ParserSettings
 
 
 @pytest.fixture(scope="module")

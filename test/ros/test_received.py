@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayes3d_ros.model.summaries import posterior_rows
+from bayes3d_ros.posterior.summarise import posterior_rows
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.received import posterior_from_messages, samples_from_rows
 from bayes3d_ros.ros.summary import summary_message

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.conversions import stamp_to_ns
 
 DEPTH = np.full((48, 64), 0.8, np.float32)

@@ -12,9 +12,9 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from bayes3d_ros.bags import BagWriter
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.io.bags import BagWriter
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.processes import shared_memory
 

@@ -18,8 +18,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
-from bayes3d_ros.model.observation import DepthFrame
 from bayes3d_ros.ros import conversions
 
 INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)

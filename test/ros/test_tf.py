@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseArray, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
-from bayes3d_ros.model.observation import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
 
 pytest.importorskip("tf2_ros", reason="tf2_ros is not on PyPI")

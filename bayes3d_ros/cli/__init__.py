@@ -1,0 +1,1 @@
+"""The `bayes3d` command."""

@@ -1,0 +1,34 @@
+"""`bayes3d import`: object models from meshes."""
+
+from pathlib import Path
+
+import click
+
+from bayes3d_ros.cli.options import FILE, FOLDER, replace_option
+from bayes3d_ros.cli.progress import progress
+
+
+@click.command(name="import")
+@click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FILE)
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
+@click.option("--voxel-size", type=click.FloatRange(0, min_open=True), default=0.003, show_default=True, help="Metres.")
+@click.option(
+    "--scale",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Metres that a unit of the meshes is: 0.001 for millimetres.",
+)
+@replace_option
+def import_meshes(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: float, replace: bool) -> None:
+    """Make object models from meshes in metres; a model is named after its file. All or none are written."""
+    from bayes3d_ros.objects.mesh_import import make_models
+    from bayes3d_ros.objects.model import save_model
+
+    models = make_models(meshes, library, voxel_size, scale=scale, replace=replace)
+    for made in list(progress(models, len(meshes), "mesh")):
+        path = save_model(made.model, library, replace=replace or made.replaces)
+        again = f", replaces an earlier import of {made.mesh.name}" if made.replaces else ""
+        click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB{again}")
+        if made.warning:
+            click.echo(f"{made.mesh}: {made.warning}", err=True)

@@ -1,0 +1,64 @@
+"""`bayes3d learn`: a model of an object from views of it."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bayes3d_ros.cli.errors import InputError
+from bayes3d_ros.cli.options import ANY, FOLDER, replace_option, settings_from
+from bayes3d_ros.cli.progress import progress
+
+
+@click.command()
+@click.argument("bag", type=ANY)
+@click.option("--name", required=True, help="What to call the object: letters, digits, '_' and '-'.")
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
+@click.option("--voxel-size", type=float, help="Metres; default 0.004.")
+@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--views", type=click.IntRange(1, 10), default=10, show_default=True, help="Most views to use.")
+@click.option("--cluster", type=click.Choice(["only", "largest", "central"]), help="Which of several things to learn.")
+@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
+@replace_option
+def learn(
+    bag: Path,
+    name: str,
+    library: Path,
+    topic: str | None,
+    views: int,
+    more: tuple[str, ...],
+    replace: bool,
+    **options: Any,
+) -> None:
+    """Learn a model of an object from views of it: depth, CameraInfo and camera_pose of one stamp each."""
+    from bayes3d_ros.io.bags import read_frames
+    from bayes3d_ros.io.model_plot import plot_model
+    from bayes3d_ros.learning.learn import check_name, spread_views
+    from bayes3d_ros.learning.learn import learn as learn_model
+    from bayes3d_ros.objects.model import refuse_existing, save_model
+    from bayes3d_ros.settings import LearnerSettings
+
+    check_name(name)
+    if not replace:
+        refuse_existing(library, name)
+    settings = settings_from(LearnerSettings, more, options)
+    reader = read_frames(bag, topic)
+    poses = [frame.T_table_camera for frame in progress(reader, len(reader), "frame")]
+    chosen = set(spread_views(poses, views))
+    if not chosen:
+        raise InputError(
+            f"{bag}: {reader.depth_topic}: none of its {len(poses)} frames has a camera_pose (PoseStamped) of its stamp"
+        )
+    frames = [frame for k, frame in enumerate(reader) if k in chosen]
+    learned = learn_model(frames, name, settings)
+    for number, view in enumerate(learned.views, 1):
+        told = view.refused or (
+            f"{view.points} points, pose corrected by {1e3 * view.shift:.1f} mm, {view.turn * 57.29578:.2f} degrees"
+        )
+        click.echo(f"view {number}  {view.stamp_ns}  {'left out: ' * bool(view.refused)}{told}", err=bool(view.refused))
+    model, size = learned.model, " x ".join(f"{v:.3f}" for v in learned.model.box_size)
+    used = sum(not view.refused for view in learned.views)
+    click.echo(f"{name}: {size} m, {len(model.surface_index)} surface voxels, {learned.coverage:.0%} of them seen")
+    title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
+    click.echo(f"{save_model(model, library, replace=replace)}")
+    click.echo(f"{plot_model(model, library / f'{name}.png', title)}")

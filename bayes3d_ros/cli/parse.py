@@ -1,0 +1,76 @@
+"""`bayes3d parse`: every depth frame of a bag into a posterior over scenes."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
+from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from
+from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
+
+if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
+    from bayes3d_ros.io.bags import FrameReader
+    from bayes3d_ros.objects.model import Library
+    from bayes3d_ros.settings import ParserSettings
+
+
+@click.command()
+@click.argument("bag", type=ANY)
+@click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
+@click.option("--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz and frames/.")
+@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
+@click.option("--table", type=click.Choice(["auto", "pose", "depth"]), help="Where the table's plane comes from.")
+@click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
+@click.option("--particles", type=int, help="Scenes carried by the sampler.")
+@click.option("--max-objects", type=int, help="Most objects a scene may hold.")
+@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
+@device_option
+def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
+    """Parse every depth frame of BAG into a posterior over scenes."""
+    from bayes3d_ros.io.bags import read_frames
+    from bayes3d_ros.objects.model import load_library
+    from bayes3d_ros.settings import ParserSettings
+
+    settings = settings_from(ParserSettings, more, options)
+    models = load_library(library)
+    frames = read_frames(bag, topic)
+    click.echo(recording_line(frames))
+    done, failed = _parse_frames(frames, models, settings, out)
+    if failed and not done:
+        raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
+    parsed = f"{done} frame{'s' * (done != 1)} parsed" + (f", {failed} could not be" if failed else "")
+    click.echo(f"{parsed}; results in {out}")
+
+
+def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSettings", out: Path) -> tuple[int, int]:
+    """How many frames were parsed, and how many could not be."""
+    from bayes3d_ros.io.plots import plot_scene
+    from bayes3d_ros.io.results import ResultsWriter
+    from bayes3d_ros.jax_runtime import enable_cache
+    from bayes3d_ros.parsing.parser import SceneParser
+    from bayes3d_ros.posterior.types import ParseError
+
+    enable_cache()
+    parser = SceneParser(library, settings)
+    failed = 0
+    notes: tuple[str, ...] = ()
+    with ResultsWriter(out, library.names) as results:
+        for frame in progress(frames, len(frames), "frame"):
+            camera = frame.intrinsics
+            if not parser.compiled_for(camera.width, camera.height):
+                with timed(COMPILING):  # beforehand, so that `seconds` are those of a running system
+                    parser.warm_up(camera.width, camera.height)
+            try:
+                posterior = parser.parse(frame)
+            except ParseError as error:
+                failed += 1
+                say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+                continue
+            picture = results.write(frame.depth, posterior)
+            title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
+            plot_scene(frame.depth, posterior, picture, title, camera)
+            for line in (frame_line(posterior), *note_lines(posterior, notes)):
+                say(line)
+            notes = posterior.notes
+        return results.frames, failed

@@ -1,1 +1,0 @@
-"""Simulation, metrics, experiments and benchmarks. No ROS."""

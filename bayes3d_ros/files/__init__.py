@@ -1,0 +1,1 @@
+"""Small files that others may have written or damaged, and files that are replaced whole or not at all."""

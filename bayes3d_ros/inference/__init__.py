@@ -1,1 +1,0 @@
-"""How the posterior is found."""

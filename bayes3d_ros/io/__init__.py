@@ -1,0 +1,1 @@
+"""Recordings, result files and pictures."""

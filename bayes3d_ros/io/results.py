@@ -1,0 +1,154 @@
+"""Files of a parsed recording: scenes.jsonl, samples.npz and frames/STAMP_NS.npz (docs/outputs.md describes them)."""
+
+import json
+import os
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.lib import format as npy
+
+from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
+from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
+
+SCENES, SAMPLES, FRAMES = "scenes.jsonl", "samples.npz", "frames"
+
+
+class ResultsError(Exception):
+    """A folder that results cannot be written to; one line naming it."""
+
+
+def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
+    """The line of scenes.jsonl, as JSON values. What is not a finite number is null."""
+    height, width = posterior.segmentation.shape
+    return {
+        "stamp_ns": int(posterior.stamp_ns),
+        "frame_id": posterior.frame_id,
+        "size": [width, height],
+        "seconds": round(float(posterior.seconds), 4),
+        "log_evidence": json_number(posterior.log_evidence),
+        "num_objects": {str(n): json_number(p) for n, p in posterior.num_objects.items()},
+        "noise": {"p_outlier": json_number(posterior.p_outlier), "sigma": json_number(posterior.sigma)},
+        "objects": [_object_record(found) for found in posterior.objects],
+        "T_camera_table": json_numbers(posterior.T_camera_table),
+        "ess": json_numbers(posterior.ess),
+        "usable_share": json_number(posterior.usable_share),
+        "notes": list(posterior.notes),
+    }
+
+
+def _object_record(found: ObjectEstimate) -> dict[str, Any]:
+    return {
+        "type": found.type,
+        "type_probabilities": {name: json_number(p) for name, p in found.type_probabilities.items()},
+        "probability": json_number(found.probability),
+        "position": json_numbers(found.position),
+        "orientation": json_numbers(found.orientation),
+        "covariance": json_numbers(found.covariance),
+        "contact_face": int(found.contact_face),
+        "face_probabilities": json_numbers(found.face_probabilities),
+        "modes": [_mode_record(mode) for mode in found.modes],
+    }
+
+
+def _mode_record(mode: PoseMode) -> dict[str, Any]:
+    return {
+        "weight": json_number(mode.weight),
+        "position": json_numbers(mode.position),
+        "orientation": json_numbers(mode.orientation),
+        "covariance": json_numbers(mode.covariance),
+        "contact_face": int(mode.contact_face),
+    }
+
+
+class ResultsWriter:
+    """Writes the results of one recording into a folder; a context manager.
+
+    Whatever ends the run, even a kill, scenes.jsonl holds whole lines of whole frames; samples.npz is written on
+    leaving the context, from rows kept on disk until then. Results that an earlier run left in the folder are
+    replaced. The same posteriors give the same bytes, `seconds` aside.
+    """
+
+    def __init__(self, folder: Path, types: Sequence[str]) -> None:
+        self.folder, self.types = Path(folder), tuple(types)
+        self.frames = 0
+        self._stamps: Counter[int] = Counter()
+
+    def __enter__(self) -> "ResultsWriter":
+        try:
+            (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
+            if (self.folder / SCENES).exists():  # an earlier run's frames would look like this one's
+                for path in (self.folder / FRAMES).iterdir():
+                    if re.fullmatch(r"-?\d+(_\d+)?\.(npz|png)", path.name):
+                        path.unlink()
+                (self.folder / SAMPLES).unlink(missing_ok=True)
+            self._scenes = (self.folder / SCENES).open("w")
+            self._rows = (self.folder / f".{SAMPLES}.rows").open("w+b")
+        except OSError as error:
+            raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
+        return self
+
+    def write(self, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Path:
+        """Append a frame; depth is what was parsed, in metres. Returns where its PNG belongs. Raises OSError."""
+        try:
+            path = self.folder / FRAMES / f"{self._frame_name(posterior.stamp_ns)}.npz"
+            temporary = path.with_name(f".{path.name}.tmp")
+            with temporary.open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    depth=np.asarray(depth, np.float32),
+                    reconstruction=np.asarray(posterior.reconstruction, np.float32),
+                    segmentation=np.asarray(posterior.segmentation, np.uint16),
+                )
+            os.replace(temporary, path)
+            rows = posterior_rows(posterior.samples, posterior.object_index)
+            framed = np.zeros(len(rows), _ROW)
+            for name, _ in POSTERIOR_FIELDS:
+                framed[name] = rows[name]
+            framed["frame"] = self.frames
+            self._rows.write(framed.tobytes())
+            self._scenes.write(json.dumps(scene_record(posterior), allow_nan=False) + "\n")
+            self._scenes.flush()
+        except OSError as error:  # a full disk; its error does not say where
+            raise OSError(error.errno, error.strerror, str(self.folder)) from error
+        self.frames += 1
+        return path.with_suffix(".png")
+
+    def _frame_name(self, stamp_ns: int) -> str:
+        """The stamp; STAMP_2, STAMP_3, ... where a recording repeats it, so that no frame replaces another."""
+        self._stamps[stamp_ns] += 1
+        count = self._stamps[stamp_ns]
+        return f"{stamp_ns}" if count == 1 else f"{stamp_ns}_{count}"
+
+    def __exit__(self, *error: Any) -> None:
+        self._scenes.close()
+        self._rows.flush()
+        rows = np.memmap(self._rows, _ROW, "r") if self._rows.tell() else np.zeros(0, _ROW)
+        temporary = self.folder / f".{SAMPLES}.tmp"
+        # Column by column: a long recording's samples need not fit into memory.
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            columns = {name: rows[name] for name in _ROW.names or ()} | {"types": np.array(self.types, "U")}
+            for name, column in columns.items():
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
+                    npy.write_array(file, np.ascontiguousarray(column), allow_pickle=False)
+        os.replace(temporary, self.folder / SAMPLES)
+        self._rows.close()
+        Path(self._rows.name).unlink()
+
+
+_ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])
+
+
+def json_number(value: float) -> float | None:
+    """Ten digits: more would only say how sums were ordered."""
+    return float(f"{value:.10g}") if np.isfinite(value) else None
+
+
+def json_numbers(values: Any) -> list[Any]:
+    values = np.asarray(values, float)
+    return [json_number(v) if values.ndim == 1 else json_numbers(v) for v in values]

@@ -1,0 +1,1 @@
+"""Voxel models of unknown objects from a few depth views. `learn.py` is the way in."""

@@ -1,0 +1,213 @@
+"""Depth views of one object, fused into a solid on a voxel grid.
+
+Every view votes on every voxel: for a surface where points fall into it, for free space where rays pass through to
+something behind it; what a view's rays do not reach it says nothing of. Votes are log odds, so that flying pixels of
+one view, or one view whose pose is wrong, lose against the others. Planes are then fitted to the points of the voxels
+that won. Voxels that nobody saw count as solid inside the convex hull of the surface, and are known to be unseen.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from bayes3d_ros.geometry.camera import nearest_pixels
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.mesh import SurfaceSamples
+from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
+from bayes3d_ros.learning.segment import Surface
+
+# Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.
+_HIT, _PASS, _GLIMPSE = 2.5, 3.0, 1.0
+_BEHIND = 0.004  # metres, beside the voxel's own size, that a return lies behind a voxel that its ray passed
+_LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
+_FEWEST = 4  # voxels of a piece that is kept
+_MOST_VOXELS = 4_000_000
+_FOOT = 0.015  # metres: what is seen so low is taken to reach down to the table
+_THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)
+
+
+class Grid(NamedTuple):
+    """Voxels of a box in the table frame; the table is half a voxel above the box's base, in the lowest layer's middle:
+    a flat base on the face between two layers would be in both or in none."""
+
+    origin: Float[np.ndarray, "3"]
+    shape: tuple[int, int, int]
+    voxel_size: float
+
+    def voxel_of(self, points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
+        """Flat index of the voxel of each point."""
+        cell = np.clip(((points - self.origin) / self.voxel_size).astype(int), 0, np.array(self.shape) - 1)
+        return np.ravel_multi_index(tuple(cell.T), self.shape)
+
+    def centres(self) -> Float[np.ndarray, "V 3"]:
+        """In the order of flat indices."""
+        return self.origin + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.voxel_size
+
+
+class Fused(NamedTuple):
+    """An object in the table frame."""
+
+    solid: VoxelSolid
+    views: Int[np.ndarray, "S"]  # how many views saw each surface voxel; 0 where it was never seen but must be
+    hull: Float[np.ndarray, "H 3"]  # corners of its convex hull
+
+
+class FusionError(Exception):
+    """Views that make no solid; one line that says why."""
+
+
+class Seen(NamedTuple):
+    """An object in one view: its points, and the whole depth image with the camera's pose."""
+
+    surface: Surface
+    frame: DepthFrame
+    T_table_camera: Float[np.ndarray, "4 4"]
+
+
+def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
+    """Raises FusionError with one line where nothing is left of the object."""
+    grid = _grid([view.surface for view in views], voxel_size)
+    centres = grid.centres()
+    hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
+    rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
+    passes, glimpses = rays.reshape(2, *grid.shape)
+    surface = _pieces((hits > 0) & (_HIT * hits - _GLIMPSE * glimpses - (_PASS - _GLIMPSE) * passes > 0))
+    if not surface.any():
+        raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
+    points, normals = (np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True))
+    index = grid.voxel_of(points)
+    kept = surface.ravel()[index]
+    points, normals, index = points[kept], normals[kept], index[kept]
+    area = voxel_size**2 / float(np.median(np.unique(index, return_counts=True)[1]))
+    patches = fit_planes(SurfaceSamples(points, normals, area), grid.origin, voxel_size, grid.shape)
+    noise = _noise_of_a_neighbour(patches, grid)
+    voxel = patches.voxel[~noise]
+    seen, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+    seen[tuple(voxel.T)] = True
+    # Where noise was dropped the plane next door decides; behind it is solid.
+    behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
+    centre = grid.origin + (voxel + 0.5) * voxel_size
+    hull = _hull(centre + patches.normal[~noise] * patches.offset[~noise, None])  # points would count with their noise
+    unknown = (hits + glimpses == 0) & _within(hull, grid)
+    solid = _pieces(seen | behind | unknown)
+    unseen = _unseen_surface(solid, seen)
+    counts = np.concatenate([hits[tuple(voxel.T)], np.zeros(len(unseen.voxel), int)])
+    voxel = np.concatenate([voxel, unseen.voxel])
+    normal = np.concatenate([patches.normal[~noise], unseen.normal])
+    offset = np.concatenate([patches.offset[~noise], np.zeros(len(unseen.voxel))])
+    order = np.argsort(np.ravel_multi_index(tuple(voxel.T), grid.shape))
+    surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order])
+    return Fused(surface_of, counts[order], hull.points[hull.vertices])
+
+
+def _grid(surfaces: Sequence[Surface], voxel_size: float) -> Grid:
+    points = np.concatenate([surface.points for surface in surfaces])
+    low, high = points.min(0), points.max(0)
+    low[:2], high = low[:2] - voxel_size, high + voxel_size
+    low[2] = -voxel_size / 2
+    shape = np.maximum(np.ceil((high - low) / voxel_size).astype(int), 1)
+    if shape.prod() > _MOST_VOXELS:
+        size = " x ".join(f"{n}" for n in shape)
+        raise FusionError(f"the object would fill a grid of {size} voxels: expected larger voxels than {voxel_size} m")
+    return Grid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
+
+
+def _hits(surface: Surface, grid: Grid) -> Int[np.ndarray, "V"]:
+    """1 for voxels that hold points of this view. A single one may be a stray."""
+    return (np.bincount(grid.voxel_of(surface.points), minlength=int(np.prod(grid.shape))) > 1).astype(int)
+
+
+def _passed(
+    centres: Float[np.ndarray, "V 3"], frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"], voxel_size: float
+) -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "V"]]:
+    """1 for voxels through all of which this view's rays go on to something behind them; and 1 for those through whose
+    middle one does. The first is evidence against points seen in a voxel, the second enough where there are none."""
+    low = centres[:, 2] < _LOW
+    at = np.where(low[:, None], centres * [1, 1, 0], centres)  # of the lowest what counts is the table under them
+    T = np.linalg.inv(T_table_camera)
+    u, v, z, inside = nearest_pixels(at @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
+    depth = np.where(frame.depth > 0, frame.depth, 0.0)  # NaN: no return says nothing
+    # The whole of a voxel, from any side.
+    width = np.sqrt(3) * voxel_size * frame.intrinsics.fx / max(float(np.median(z)), 1e-3)
+    nearest = ndimage.minimum_filter(depth, 2 * int(np.ceil(width / 2)) + 1)
+    around, middle = np.zeros(len(z)), np.zeros(len(z))
+    around[inside], middle[inside] = nearest[v[inside], u[inside]], depth[v[inside], u[inside]]
+    all_through = around > z + np.where(low, -_BEHIND, np.sqrt(3) / 2 * voxel_size + _BEHIND)
+    through = middle > z + np.where(low, -_BEHIND, voxel_size / 2 + _BEHIND / 2)
+    return all_through.astype(int), through.astype(int)
+
+
+def _pieces(voxels: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+    """Without crumbs."""
+    labels, count = ndimage.label(voxels, np.ones((3, 3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return (sizes >= min(_FEWEST, int(sizes.max(initial=0))))[labels] & voxels
+
+
+def _noise_of_a_neighbour(patches: Patches, grid: Grid) -> Bool[np.ndarray, "S"]:
+    """Voxels that hold only the tail of a surface next door: points of one surface scatter over two layers."""
+    voxel, normal, offset = patches.voxel, patches.normal, patches.offset
+    times, near = _THIN
+    row_of = np.full(np.array(grid.shape) + 2, -1)
+    row_of[tuple(voxel.T + 1)] = np.arange(len(voxel))
+    noise = np.zeros(len(voxel), bool)
+    for step in np.indices((3, 3, 3)).reshape(3, -1).T - 1:
+        if not step.any():
+            continue
+        other = row_of[tuple((voxel + 1 + step).T)]
+        seen = patches.centroid - step * grid.voxel_size  # from the neighbour's centre
+        miss = np.abs(np.einsum("ij,ij->i", normal[other], seen) - offset[other])
+        same = np.einsum("ij,ij->i", normal, normal[other]) > 0.5
+        across = np.abs(normal[other] @ step) / np.linalg.norm(step) > 0.6  # behind or before it, not beside
+        more = patches.area[other] > times * patches.area
+        noise |= (other >= 0) & same & across & more & (miss < near * grid.voxel_size)
+    return noise
+
+
+def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
+    """Convex hull of the surface and of what it stands on."""
+    feet = points[points[:, 2] < points[:, 2].min() + _FOOT] * [1, 1, 0]
+    try:
+        return ConvexHull(np.concatenate([points, feet]))
+    except ValueError as error:  # QhullError is one
+        raise FusionError(f"the points seen have no volume ({str(error).splitlines()[0][:80]})") from None
+
+
+def _within(hull: ConvexHull, grid: Grid) -> Bool[np.ndarray, "X Y Z"]:
+    """Voxels whose middles lie in the hull: between its highest and lowest plane of their column."""
+    x, y, z = (grid.origin[k] + (np.arange(grid.shape[k]) + 0.5) * grid.voxel_size for k in range(3))
+    low, high = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)
+    for plane in hull.equations:
+        outside = plane[0] * x[:, None] + plane[1] * y + plane[3]  # at z = 0, by so much
+        if abs(plane[2]) < 1e-9:
+            high[outside > 0] = -np.inf
+        elif plane[2] > 0:
+            high = np.minimum(high, -outside / plane[2])
+        else:
+            low = np.maximum(low, -outside / plane[2])
+    return (z >= low[..., None]) & (z <= high[..., None])
+
+
+class _Unseen(NamedTuple):
+    """Planes go through the voxels' middles."""
+
+    voxel: Int[np.ndarray, "U 3"]
+    normal: Float[np.ndarray, "U 3"]
+
+
+def _unseen_surface(solid: Bool[np.ndarray, "X Y Z"], seen: Bool[np.ndarray, "X Y Z"]) -> _Unseen:
+    """Voxels of the solid's rim that no view saw, with planes through their middles: on the table straight down."""
+    padded = np.pad(solid, 1)
+    rim = solid & ~ndimage.binary_erosion(padded)[1:-1, 1:-1, 1:-1] & ~seen
+    voxel = np.argwhere(rim)
+    smooth = ndimage.gaussian_filter(padded.astype(np.float32), 1.0)
+    slope = -np.stack([g[1:-1, 1:-1, 1:-1][rim] for g in np.gradient(smooth)], -1).astype(np.float64)
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    normal = np.where(length > 1e-6, slope / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    normal[voxel[:, 2] == 0] = [0.0, 0.0, -1.0]
+    return _Unseen(voxel, normal)

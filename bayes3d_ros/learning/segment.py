@@ -1,0 +1,207 @@
+"""What one calibrated depth view shows of things on the table: their surface points, in the table frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from bayes3d_ros.geometry.camera import unproject
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.parsing.support_plane import Plane, find_plane
+from bayes3d_ros.posterior.types import ParseError
+from bayes3d_ros.settings import LearnerSettings
+
+_NEAR_TABLE = 0.05  # metres above and below the table that the pose promises, in which it is looked for
+_ENOUGH = 20_000  # points to find it by
+_LOWEST = 0.003, 0.010  # metres: the least and the largest height from which a return belongs to a thing
+_EDGE = 0.02  # share of the depth by which neighbours of a good pixel may differ
+_FEWEST = 60  # pixels that make a thing
+_SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises above it is a swell of the table
+_FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
+_STANDS = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
+_NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
+
+
+class ViewError(Exception):
+    """A view that nothing can be learned from; one line that says why."""
+
+
+class Thing(NamedTuple):
+    """One of the things that stand on the table, as far as this view shows it."""
+
+    points: Float[np.ndarray, "N 3"]  # table frame
+    pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]  # rows, columns
+
+
+class Surface(NamedTuple):
+    """Of one thing, with the way it faces."""
+
+    points: Float[np.ndarray, "N 3"]  # table frame
+    normals: Float[np.ndarray, "N 3"]  # towards the camera
+
+
+class View(NamedTuple):
+    """A depth frame taken apart."""
+
+    frame: DepthFrame
+    T_table_camera: Float[np.ndarray, "4 4"]  # with the table's plane put where the frame shows it
+    things: tuple[Thing, ...]  # largest first
+
+
+def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
+    """Find the table near where the camera pose puts it, correct height and tilt of the pose by it, and cut what rises
+    from it into things. Raises ViewError with one line where there is no pose, no table or nothing on it."""
+    if frame.T_table_camera is None:
+        raise ViewError("no camera pose for this view, a learner needs one")
+    with np.errstate(invalid="ignore"):
+        returned = (frame.depth >= settings.near) & (frame.depth <= settings.far)
+    if not returned.any():
+        raise ViewError(f"the depth image has no return between {settings.near} and {settings.far} m")
+    depth = np.where(returned, frame.depth, np.nan)
+    points = unproject(depth, frame.intrinsics).astype(np.float64)
+    T_table_camera = _on_its_table(points, frame.T_table_camera, settings)
+    local = points @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
+    with np.errstate(invalid="ignore"):
+        inside = _inside(local, settings) & (local[..., 2] < settings.workspace_height)
+        flat = inside & (np.abs(local[..., 2]) < _LOWEST[1])
+    spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
+    lowest = float(np.clip(3 * spread, *_LOWEST))
+    risen = inside & (local[..., 2] > lowest) & _undisturbed(depth)
+    firm = _firm(risen, np.isfinite(depth))
+    labels = _things(local, risen, firm, settings.gap)
+    sizes = np.bincount(labels[firm], minlength=labels.max() + 1)
+    above_swells = np.bincount(labels[firm & (local[..., 2] > _SWELL * lowest)], minlength=len(sizes))
+    foot = np.full(len(sizes), np.inf)
+    np.minimum.at(foot, labels[risen], local[risen][:, 2])
+    stands = (sizes >= _FEWEST) & (above_swells >= _FEWEST / 4) & (foot < _STANDS)
+    found = [k for k in np.argsort(-sizes) if k > 0 and stands[k]]
+    if not found:
+        raise ViewError(
+            f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
+            f"{1e3 * lowest:.0f} mm above it, expected at least {_FEWEST} together)"
+        )
+    pixels = [np.nonzero(labels == k) for k in found]
+    return View(frame, T_table_camera, tuple(Thing(local[where], where) for where in pixels))
+
+
+def surface(view: View, thing: Thing) -> Surface:
+    """With normals of planes fitted to what the thing shows around each of its pixels."""
+    distance = float(np.median(view.frame.depth[thing.pixels]))
+    side = 2 * int(np.clip(round(_NORMAL_RADIUS * view.frame.intrinsics.fx / distance), 2, 8)) + 1
+    rows, columns = thing.pixels
+    at = rows - rows.min(), columns - columns.min()
+    shape = at[0].max() + 1, at[1].max() + 1
+    mask = np.zeros(shape)
+    mask[at] = 1.0
+    p = np.zeros((*shape, 3))
+    p[at] = thing.points - thing.points.mean(0)
+
+    def mean_around(a: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return ndimage.uniform_filter(a, side, mode="constant")
+
+    number = mean_around(mask)[at]
+    first = np.stack([mean_around(p[..., i])[at] / number for i in range(3)], -1)
+    second = np.empty((len(rows), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            moment = mean_around(p[..., i] * p[..., j])[at] / number
+            second[:, i, j] = second[:, j, i] = moment - first[:, i] * first[:, j]
+    normals = np.linalg.eigh(second)[1][..., 0]
+    away = np.einsum("ni,ni->n", normals, thing.points - view.T_table_camera[:3, 3]) > 0
+    return Surface(thing.points, np.where(away[:, None], -normals, normals))
+
+
+def middle(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "2"]:
+    """On the table, of their bounding rectangle."""
+    return (points[:, :2].min(0) + points[:, :2].max(0)) / 2
+
+
+def _inside(local: Float[np.ndarray, "H W 3"], settings: LearnerSettings) -> Bool[np.ndarray, "H W"]:
+    x, y = local[..., 0] - settings.workspace_x, local[..., 1] - settings.workspace_y
+    return (np.abs(x) < settings.workspace_width / 2) & (np.abs(y) < settings.workspace_depth / 2)
+
+
+def _on_its_table(
+    points: Float[np.ndarray, "H W 3"], T_table_camera: Float[np.ndarray, "4 4"], settings: LearnerSettings
+) -> Float[np.ndarray, "4 4"]:
+    """The pose turned and raised by as little as puts the table that is seen at z = 0."""
+    rotation, position = T_table_camera[:3, :3], T_table_camera[:3, 3]
+    local = points @ rotation.T + position
+    with np.errstate(invalid="ignore"):
+        near = _inside(local, settings) & (np.abs(local[..., 2]) < _NEAR_TABLE)
+    try:
+        plane = find_plane(points[near][:: max(1, near.sum() // _ENOUGH)])
+    except ParseError:
+        raise ViewError(
+            f"no table within {1e3 * _NEAR_TABLE:.0f} mm of where the camera pose puts it, inside the workspace"
+        ) from None
+    normal = rotation @ plane.normal
+    up = np.array([0.0, 0.0, 1.0])
+    axis, cosine = np.cross(normal, up), float(normal @ up)
+    if cosine < np.cos(settings.max_turn):
+        raise ViewError(
+            f"the table is tilted by {np.degrees(np.arccos(cosine)):.1f} degrees against the camera pose, "
+            f"expected at most {np.degrees(settings.max_turn):.1f}"
+        )
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = np.eye(3) + skew + skew @ skew / (1 + cosine)
+    # About the middle of the workspace, so that x and y of what stands there stay.
+    middle = np.array([settings.workspace_x, settings.workspace_y, 0.0])
+    height = _height(plane, rotation, position, middle)
+    if abs(height) > settings.max_shift:
+        raise ViewError(
+            f"the table is {1e3 * abs(height):.0f} mm from where the camera pose puts it, "
+            f"expected at most {1e3 * settings.max_shift:.0f}"
+        )
+    corrected = np.eye(4)
+    corrected[:3, :3] = turn @ rotation
+    corrected[:3, 3] = turn @ (position - middle - [0, 0, height]) + middle
+    return corrected
+
+
+def _height(
+    plane: Plane,
+    rotation: Float[np.ndarray, "3 3"],
+    position: Float[np.ndarray, "3"],
+    middle: Float[np.ndarray, "3"],
+) -> float:
+    """z of the plane above the middle, in the table frame of the given pose."""
+    normal = rotation @ plane.normal
+    distance = plane.distance + normal @ position
+    return float((distance - normal[:2] @ middle[:2]) / normal[2])
+
+
+def _undisturbed(depth: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose neighbours returned the like: depth cameras invent values between two surfaces."""
+    far, near = np.where(np.isnan(depth), np.inf, depth), np.where(np.isnan(depth), -np.inf, depth)
+    low, high = ndimage.minimum_filter(far, 3), ndimage.maximum_filter(near, 3)
+    share = ndimage.uniform_filter(np.isfinite(depth).astype(np.float32), 3, mode="nearest")
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(depth) & (high - low < _EDGE * depth) & (share > 0.75)
+
+
+def _firm(risen: Bool[np.ndarray, "H W"], returned: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Risen pixels in the company of others. Of a large table thousands of returns lie beyond three standard deviations
+    of its noise, most where its smooth part is high: each alone, but often within `gap` of the next."""
+    count = ndimage.uniform_filter(returned.astype(np.float32), 3, mode="constant")
+    return risen & (ndimage.uniform_filter(risen.astype(np.float32), 3, mode="constant") > _FIRM * count)
+
+
+def _things(
+    local: Float[np.ndarray, "H W 3"], risen: Bool[np.ndarray, "H W"], firm: Bool[np.ndarray, "H W"], gap: float
+) -> Int[np.ndarray, "H W"]:
+    """Labels 1.. of what firm pixels connect seen from above, over gaps narrower than `gap`, for these and the risen
+    ones beside them; 0 elsewhere."""
+    labels = np.zeros(risen.shape, int)
+    if not firm.any():
+        return labels
+    cell = gap / 4
+    xy = local[risen][:, :2]
+    index = ((xy - xy.min(0)) / cell).astype(int) + 3
+    count = np.zeros(index.max(0) + 4, int)
+    np.add.at(count, tuple(index[firm[risen]].T), 1)
+    disc = np.hypot(*np.mgrid[-2:3, -2:3]) <= 2
+    pieces, _ = ndimage.label(ndimage.binary_dilation(count > 0, disc), np.ones((3, 3)))
+    labels[risen] = pieces[tuple(index.T)]
+    return labels

@@ -1,0 +1,108 @@
+"""Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from bayes3d_ros.geometry.se3 import product
+from bayes3d_ros.likelihood.density import NO_RETURN, Noise, log_likelihood, outlier_density
+from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
+from bayes3d_ros.likelihood.hypotheses import Drawn
+from bayes3d_ros.likelihood.march import march
+from bayes3d_ros.likelihood.plane import plane_depth
+from bayes3d_ros.likelihood.scored_image import Image, observed
+from bayes3d_ros.likelihood.tiled_render import over_depth
+from bayes3d_ros.likelihood.tiles import tile_size, tiles_of_objects
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+
+
+class World(NamedTuple):
+    """What the camera moves through."""
+
+    type: Int[Array, "K"]
+    T_world_object: Float[Array, "K 4 4"]
+    table: Bool[Array, ""]  # whether the plane z = 0 is a surface
+
+
+def table_depth(
+    T_camera_world: Float[Array, "*n 4 4"], x: Float[Array, "*shape"], y: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Depth of the plane z = 0 of the world along rays (x, y, 1), inf where they do not meet its upper side."""
+    normal, origin = T_camera_world[..., :3, 2], T_camera_world[..., :3, 3]
+    return plane_depth([normal[..., a] for a in range(3)], (normal * origin).sum(-1), x, y)
+
+
+@partial(jax.jit, static_argnames="window")
+def log_likelihood_of_cameras(
+    T_camera_world: Float[Array, "N 4 4"],
+    world: World,
+    image: Image,
+    library: LibraryArrays,
+    noise: Noise,
+    window: int,
+) -> Float[Array, "N S P"]:
+    """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
+    rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
+    `image.table` is not used."""
+    if gain := kernel(image):
+        return gain(_drawn(T_camera_world, world), None, image, library, noise, window)
+    half = window // 2
+    size = tile_size(image.depth.shape[1])
+    count, objects = len(T_camera_world), len(world.type)
+    T = product(T_camera_world[:, None], world.T_world_object)
+    kinds = jnp.broadcast_to(world.type, (count, objects))
+    drawn, scored = (tiles_of_objects(T, kinds, image, library, grown, world.table, size.tile) for grown in (0, half))
+
+    def draw(n, rays):
+        return depth_along(T_camera_world[n], world, library, rays)
+
+    def score(total, n, u, v, depth, real):
+        pixels = observed(image, u, v, (size.tile, size.tile))
+        value = log_likelihood(depth, pixels, noise, window)
+        alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
+        return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
+
+    start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    return over_depth(score, start, draw, drawn, scored, count, image, half, size)
+
+
+def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> Drawn:
+    """The world as every camera sees it."""
+    normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
+    plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
+    return Drawn(
+        type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
+        T_camera_object=product(T_camera_world[:, None], world.T_world_object),
+        plane=jnp.where(world.table, plane, 0.0),
+        everywhere=world.table,
+    )
+
+
+def depth_along(
+    T_camera_world: Float[Array, "*n 4 4"],
+    world: World,
+    library: LibraryArrays,
+    rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
+) -> Float[Array, "*shape"]:
+    """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is; `n` broadcasts against `shape` from
+    the right."""
+    depth = jnp.where(world.table, table_depth(T_camera_world, *rays), jnp.inf)
+    for k in range(len(world.type)):
+        T = product(T_camera_world, world.T_world_object[k])
+        depth = jnp.minimum(depth, march(library, world.type[k], T, rays))
+    return depth
+
+
+def render_cameras(
+    T_camera_world: Float[Array, "N 4 4"], world: World, image: Image, library: LibraryArrays
+) -> Float[Array, "N H W"]:
+    """What each camera sees in the pixels of an image."""
+    if depth := depth_kernel():
+        return depth(_drawn(T_camera_world, world), None, image, library)
+    shape = (len(T_camera_world), *image.depth.shape)
+    rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
+    own = jnp.arange(shape[1])[:, None] < image.own_rows
+    return jnp.where(own, depth_along(T_camera_world[:, None, None], world, library, rays), jnp.inf)

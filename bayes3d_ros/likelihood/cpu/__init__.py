@@ -1,0 +1,1 @@
+"""Hypotheses rendered and scored by loops that numba compiles."""

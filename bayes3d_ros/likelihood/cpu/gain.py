@@ -1,0 +1,98 @@
+"""The loops of `loops.py` as functions of JAX, for CPUs."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.likelihood.cpu import loops
+from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
+from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+
+_NEGLIGIBLE = 14.0  # nats below the outliers' density: one in a million
+
+
+@partial(jax.jit, static_argnames="window")
+def compiled_gain(
+    drawn: Drawn, scenes: Scenes | None, image: Image, library: LibraryArrays, noise: Noise, window: int
+) -> Float[Array, "N S P"]:
+    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    without scenes, nothing is there before."""
+    shape = (len(drawn.type), len(noise.sigma), len(noise.p_outlier))
+    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight)
+    inputs = (
+        *_things(drawn, library),
+        _real(image.depth),
+        _whole(image.kind),
+        _real(image.ray_x),
+        _real(image.ray_y),
+        _real([*numbers, *_reach(image, noise, window)]),
+        jnp.zeros(0) if scenes is None else _real(scenes.depth),
+        jnp.zeros(0, jnp.int32) if scenes is None else _whole(scenes.ancestor),
+        _real(noise.sigma),
+        _real(noise.p_outlier),
+        _whole([window, drawn.everywhere, *((0, 0) if scenes is None else scenes.depth.shape[1:]), image.own_rows]),
+    )
+    return _call(loops.GAIN, shape, inputs)
+
+
+@partial(jax.jit, static_argnames="border")
+def compiled_depth(
+    drawn: Drawn, start: Float[Array, "N Hp Wp"] | None, image: Image, library: LibraryArrays, border: int = 0
+) -> Float[Array, "N Hp Wp"]:
+    """Depth of what is drawn where it is nearer than what there is to start with, inf where nothing is. Images to start
+    with have so many pixels before the camera's first row and column, and any number after the last."""
+    shape = (len(drawn.type), *image.depth.shape) if start is None else start.shape
+    inputs = (
+        *_things(drawn, library),
+        _real(image.ray_x),
+        _real(image.ray_y),
+        _real([*image.focal, *image.centre]),
+        jnp.zeros(0) if start is None else _real(start),
+        _whole([*shape[1:], border, drawn.everywhere, image.own_rows]),
+    )
+    return _call(loops.DEPTH, shape, inputs)
+
+
+def _things(drawn: Drawn, library: LibraryArrays) -> tuple[Array, ...]:
+    return (
+        _whole(library.words),
+        _whole(library.first),
+        _whole(library.dims),
+        _real(library.origin),
+        _real(library.voxel_size),
+        _whole(drawn.type),
+        _real(library.hull_corner),
+        _whole(library.hull_count),
+        _real(drawn.T_camera_object[..., :3, :]),
+        _real(drawn.plane),
+    )
+
+
+def _call(target: str, shape: tuple[int, ...], inputs: Sequence[Array]) -> Array:
+    result = jax.ShapeDtypeStruct(shape, jnp.float32)
+    return jax.ffi.ffi_call(target, result, vmap_method="sequential")(*inputs)
+
+
+def _whole(numbers: Array | Sequence) -> Int[Array, "n"]:
+    return jnp.asarray(numbers, jnp.int32).ravel()
+
+
+def _real(numbers: Array | Sequence) -> Float[Array, "n"]:
+    return jnp.asarray(numbers, jnp.float32).ravel()
+
+
+def _reach(image: Image, noise: Noise, window: int) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How much nearer or farther than a surface, in metres and as a share of its depth, a return may be for its
+    window's density to count beside the outliers'."""
+    least = jnp.where(image.kind == IN_WORKSPACE, image.depth, jnp.inf).min()
+    peak = 1 / (jnp.sqrt(2 * jnp.pi) * noise.sigma.min() * image.outlier_scale * least**2)
+    odds = (1 - noise.p_outlier.min()) / jnp.maximum(noise.p_outlier.min(), 1e-12)
+    nats = _NEGLIGIBLE + jnp.log1p(odds * peak)
+    own = jnp.where(jnp.arange(len(image.ray_y)) < image.own_rows, image.ray_y, 0.0)
+    sides = jnp.abs(image.ray_x).max() / image.focal[0] + jnp.abs(own).max() / image.focal[1]
+    return noise.sigma.max() * jnp.sqrt(2 * nats), window // 2 * sides

@@ -1,0 +1,47 @@
+"""The kernel for a backend."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import jax
+from jaxtyping import Array, Float
+
+from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+
+
+class Gain(Protocol):
+    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    without scenes, nothing is there before."""
+
+    def __call__(
+        self, drawn: Drawn, scenes: Scenes | None, image: Image, library: LibraryArrays, noise: Noise, window: int
+    ) -> Float[Array, "N S P"]: ...
+
+
+def kernel(image: Image) -> Gain | None:
+    """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
+    tile (`tiled_render.py`): free points, other backends."""
+    if image.likelihood.name != "depth" or image.points is not None:
+        return None
+    backend = jax.default_backend()
+    if backend == "cpu":
+        from bayes3d_ros.likelihood.cpu.gain import compiled_gain  # either takes a while to import
+
+        return compiled_gain
+    if backend == "gpu":
+        from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
+
+        return triton_gain
+    return None
+
+
+def depth_kernel() -> Callable[..., Array] | None:
+    """`compiled_depth` on CPUs. On others None: there the walk of `rendering/` does as well."""
+    if jax.default_backend() != "cpu":
+        return None
+    from bayes3d_ros.likelihood.cpu.gain import compiled_depth
+
+    return compiled_depth

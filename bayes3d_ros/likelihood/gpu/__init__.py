@@ -1,0 +1,1 @@
+"""Hypotheses rendered and scored by a Triton kernel."""

@@ -1,0 +1,299 @@
+"""Hypotheses drawn and scored in one kernel (Pallas, Triton), for GPUs.
+
+A program takes one hypothesis after the other. It walks the rays of the pixels that the hypothesis can change, puts
+their depth where the windows of its own threads find it again (a patch of a few kilobytes, which stays in the cache),
+and adds up what those pixels say. There are as many patches as programs, not as hypotheses. The walk and the densities
+are those of `likelihood/march.py` and `density.py`, the same functions.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_kind, outlier_density, ray_mixture
+from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.march import (
+    MOST_STEPS,
+    NEAR,
+    NO_SURFACE,
+    advance,
+    depth_met,
+    enter_grid,
+    on_its_way,
+)
+from bayes3d_ros.likelihood.plane import plane_depth
+from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.tiles import LARGE, tiles_of_objects
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+
+_PROGRAMS = 1024  # at a time, at most
+_BLOCK = 128  # rays, or pixels, that a program's threads look at together
+_WARPS = 4
+
+
+class _Inputs(NamedTuple):
+    """All of it flat: a kernel's loads are of single elements."""
+
+    words: Any
+    first: Any  # K types
+    dims: Any  # 3 a type
+    origin: Any  # 3 a type
+    size: Any
+    type: Any  # of every object of every hypothesis
+    pose: Any  # 12 each
+    plane: Any  # 4 a hypothesis
+    rectangle: Any  # 4 a hypothesis: u, v of the first pixel and one past the last
+    depth: Any  # of the image
+    kind: Any
+    ray_x: Any
+    ray_y: Any
+    numbers: Any  # focal 2, centre 2, outlier_scale, front_margin, weight, the camera's rows
+    sigma: Any
+    p_outlier: Any
+    scenes: Any
+    ancestor: Any
+
+
+class _Shape(NamedTuple):
+    """What is static."""
+
+    hypotheses: int
+    objects: int
+    programs: int
+    height: int
+    width: int
+    sigmas: int
+    p_outliers: int  # a power of two
+    window: int
+    scene: tuple[int, ...]  # height and width of scenes with their border; empty where there are none
+    compiled: bool
+
+    @property
+    def patch(self) -> int:
+        """Pixels of a program's patch."""
+        border = 2 * (self.window // 2)
+        return (self.height + border) * (self.width + border)
+
+
+@partial(jax.jit, static_argnames=("window", "interpret"))
+def triton_gain(
+    drawn: Drawn,
+    scenes: Scenes | None,
+    image: Image,
+    library: LibraryArrays,
+    noise: Noise,
+    window: int,
+    interpret: bool | None = None,
+) -> Float[Array, "N S P"]:
+    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    without scenes, nothing is there before. Where there is no GPU it is interpreted, slowly, unless `interpret` says
+    otherwise."""
+    interpret = jax.default_backend() != "gpu" if interpret is None else interpret
+    count, objects = drawn.type.shape
+    height, width = image.depth.shape
+    columns = pl.next_power_of_2(len(noise.p_outlier))
+    # Odds that are not asked for: the last again.
+    p_outlier = noise.p_outlier[jnp.minimum(jnp.arange(columns), len(noise.p_outlier) - 1)]
+    shape = _Shape(
+        hypotheses=count,
+        objects=objects,
+        programs=min(count, _PROGRAMS),
+        height=height,
+        width=width,
+        sigmas=len(noise.sigma),
+        p_outliers=columns,
+        window=window,
+        scene=() if scenes is None else scenes.depth.shape[1:],
+        compiled=not interpret,
+    )
+    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight, image.own_rows)
+    inputs = _Inputs(
+        words=library.words,
+        first=library.first,
+        dims=library.dims.astype(jnp.float32).ravel(),
+        origin=library.origin.ravel(),
+        size=library.voxel_size,
+        type=drawn.type.ravel(),
+        pose=drawn.T_camera_object[..., :3, :].ravel(),
+        plane=drawn.plane.ravel(),
+        rectangle=_rectangles(drawn, image, library, window // 2).ravel(),
+        depth=image.depth.ravel(),
+        kind=image.kind.ravel(),
+        ray_x=image.ray_x,
+        ray_y=image.ray_y,
+        numbers=jnp.stack([jnp.asarray(n, jnp.float32) for n in numbers]),
+        sigma=noise.sigma,
+        p_outlier=p_outlier,
+        scenes=jnp.zeros(1) if scenes is None else scenes.depth.ravel(),
+        ancestor=jnp.zeros(1, jnp.int32) if scenes is None else scenes.ancestor,
+    )
+    gain, _ = pl.pallas_call(
+        partial(_kernel, shape=shape),
+        grid=(shape.programs,),
+        out_shape=(
+            jax.ShapeDtypeStruct((count * shape.sigmas * columns,), jnp.float32),
+            jax.ShapeDtypeStruct((shape.programs * shape.patch,), jnp.float32),
+        ),
+        compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
+        interpret=bool(interpret),
+        name="triton_gain",
+    )(*inputs)
+    return gain.reshape(count, shape.sigmas, columns)[:, :, : len(noise.p_outlier)]
+
+
+def _rectangles(drawn: Drawn, image: Image, library: LibraryArrays, half: int) -> Int[Array, "N 4"]:
+    """First and one past the last column and row of the pixels whose windows a hypothesis may meet."""
+    (height, width), own_rows = image.depth.shape, image.own_rows
+    tiles = tiles_of_objects(drawn.T_camera_object, drawn.type, image, library, half, drawn.everywhere, LARGE.tile)
+    rows = -(-height // LARGE.tile)
+    long, left, top = (a.reshape(-1, rows) for a in (jnp.diff(tiles.first), tiles.u, tiles.v))
+    some = long > 0
+    u0, v0 = jnp.where(some, left, width).min(1), jnp.where(some, top, own_rows).min(1)
+    u1 = jnp.where(some, left + LARGE.tile * long, 0).max(1)
+    v1 = jnp.where(some, top + LARGE.tile, 0).max(1)
+    return jnp.stack([u0, v0, jnp.minimum(u1, width), jnp.minimum(v1, own_rows)], 1)
+
+
+def _kernel(*refs: Any, shape: _Shape) -> None:
+    given, gain, patches = _Inputs(*refs[:-2]), refs[-2], refs[-1]
+    program = pl.program_id(0)
+    patch = program * shape.patch
+
+    def one(turn: Array, _: None) -> None:
+        n = program + turn * shape.programs
+
+        @pl.when(n < shape.hypotheses)
+        def draw_and_score() -> None:
+            u0, v0, u1, v1 = (given.rectangle[4 * n + k] for k in range(4))
+            _draw(given, shape, n, (u0, v0, u1, v1), patches, patch)
+            if shape.compiled:  # interpreted, there is one thread
+                triton.debug_barrier()
+            _score(given, shape, n, (u0, v0, u1, v1), patches, patch, gain)
+            if shape.compiled:
+                triton.debug_barrier()
+
+    jax.lax.fori_loop(0, -(-shape.hypotheses // shape.programs), one, None)
+
+
+def _blocks(area: Array, across: Array) -> tuple[Array, Any]:
+    """How many blocks there are in so many pixels; block(k): their number, row and column, and whether they are any."""
+
+    def block(k: Array) -> tuple[Array, Array, Array, Array]:
+        index = k * _BLOCK + jax.lax.iota(jnp.int32, _BLOCK)
+        row = index // jnp.maximum(across, 1)
+        return index, row, index - row * across, index < area
+
+    return (area + _BLOCK - 1) // _BLOCK, block
+
+
+def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
+    """Depth of a hypothesis in its rectangle, and half a window around."""
+    half = shape.window // 2
+    u0, v0, u1, v1 = rectangle
+    wide, tall = u1 - u0 + 2 * half, v1 - v0 + 2 * half
+    area = jnp.where((u1 > u0) & (v1 > v0), wide * tall, 0)
+    count, block = _blocks(area, wide)
+    fx, fy, cx, cy = (given.numbers[k] for k in range(4))
+    own_rows = given.numbers[7].astype(jnp.int32)
+    normal = [given.plane[4 * n + k] for k in range(3)]
+    offset = given.plane[4 * n + 3]
+
+    def look_up(index: Array, cell: list[Array]) -> tuple[Array, list[Array]]:
+        return triton.load(given.words.at[index]), cell
+
+    def draw(k: Array, _: None) -> None:
+        index, row, column, real = block(k)
+        u, v = u0 - half + column, v0 - half + row
+        inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < own_rows)
+        x, y = (u.astype(jnp.float32) - cx) / fx, (v.astype(jnp.float32) - cy) / fy
+        depth = plane_depth(normal, offset, x, y)
+        for which in range(shape.objects):
+            thing = n * shape.objects + which
+            kind = given.type[thing]
+            walk, t = enter_grid(
+                given.first[kind],
+                [given.dims[3 * kind + a] for a in range(3)],
+                [given.origin[3 * kind + a] for a in range(3)],
+                given.size[kind],
+                [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
+                (x, y),
+                NEAR,
+            )
+            walk = walk._replace(leave=jnp.where(inside, walk.leave, -NO_SURFACE))
+
+            def unfinished(state: tuple[Array, Array], walk=walk) -> Array:
+                step, t = state
+                return (step < MOST_STEPS) & (jnp.max(on_its_way(t, walk.leave).astype(jnp.int32)) > 0)
+
+            def go(state: tuple[Array, Array], walk=walk) -> tuple[Array, Array]:
+                step, t = state
+                return step + 1, advance(look_up, walk, t, NEAR)
+
+            t = jax.lax.while_loop(unfinished, go, (jnp.int32(0), t))[1]
+            depth = jnp.minimum(depth, depth_met(t))
+        triton.store(patches.at[patch + index], jnp.where(inside, depth, NO_SURFACE), mask=real)
+
+    jax.lax.fori_loop(0, count, draw, None)
+
+
+def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array, gain: Any) -> None:
+    """What the pixels of the rectangle say, for every sigma and p_outlier."""
+    half = shape.window // 2
+    u0, v0, u1, v1 = rectangle
+    wide = u1 - u0
+    count, block = _blocks(jnp.where(v1 > v0, wide * (v1 - v0), 0), wide)
+    fx, fy, _, _, outlier_scale, front_margin, weight = (given.numbers[k] for k in range(7))
+    columns = jax.lax.iota(jnp.int32, shape.p_outliers)
+    p = triton.load(given.p_outlier.at[columns])[None]
+
+    def log_of(pixels: Pixels, rendered: Any, sigma: Array) -> Float[Array, "B P"]:
+        density, seen = ray_mixture(rendered, pixels, sigma, shape.window)
+        inlier = jnp.where(seen, density, outlier_density(pixels))
+        outlier, inlier = by_kind(pixels, rendered(0, 0), inlier)
+        return jnp.log(p * outlier[:, None] + (1 - p) * inlier[:, None])
+
+    def look(k: Array, total: Float[Array, "P"], sigma: Array) -> Float[Array, "P"]:
+        _, row, column, real = block(k)
+        u, v = jnp.where(real, u0 + column, 0), jnp.where(real, v0 + row, 0)
+        at = v * shape.width + u
+        pixels = Pixels(
+            depth=triton.load(given.depth.at[at]),
+            kind=triton.load(given.kind.at[at]),
+            ray_x=triton.load(given.ray_x.at[u]),
+            ray_y=triton.load(given.ray_y.at[v]),
+            step_x=1 / fx,
+            step_y=1 / fy,
+            outlier_scale=outlier_scale,
+            front_margin=front_margin,
+        )
+
+        def drawn(dv: int, du: int) -> Array:
+            place = (row + half + dv) * (wide + 2 * half) + column + half + du
+            return triton.load(patches.at[patch + place], mask=real, other=NO_SURFACE)
+
+        if not shape.scene:
+            alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels)))[:, None]
+            value = log_of(pixels, drawn, sigma)
+        else:
+            scene_height, scene_width = shape.scene
+            first = given.ancestor[n] * scene_height * scene_width
+
+            def before(dv: int, du: int) -> Array:
+                place = first + (v + half + dv) * scene_width + u + half + du
+                return triton.load(given.scenes.at[place])
+
+            alone = log_of(pixels, before, sigma)
+            value = log_of(pixels, lambda dv, du: jnp.minimum(before(dv, du), drawn(dv, du)), sigma)
+        return total + jnp.sum(jnp.where(real[:, None], value - alone, 0.0), 0)
+
+    def one_sigma(s: Array, _: None) -> None:
+        sigma = given.sigma[s]
+        total = jax.lax.fori_loop(0, count, partial(look, sigma=sigma), jnp.zeros(shape.p_outliers, jnp.float32))
+        triton.store(gain.at[(n * shape.sigmas + s) * shape.p_outliers + columns], weight * total)
+
+    jax.lax.fori_loop(0, shape.sigmas, one_sigma, None)

@@ -1,0 +1,84 @@
+"""The slow renderer that defines the right answer, float64: every ray against every voxel that it may enter."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from bayes3d_ros.objects.library_arrays import INFLATION
+from bayes3d_ros.objects.model import ObjectModel
+
+_CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
+_AT_A_TIME = 256  # rays, which bounds memory
+
+
+def render(
+    model: ObjectModel,
+    T_camera_object: Float[np.ndarray, "4 4"],
+    rays: Float[np.ndarray, "P 3"],
+    near: float = 0.05,
+) -> Float[np.ndarray, "P"]:
+    """Depth z in metres of the nearest hit along each ray (r_z = 1), inf where there is none."""
+    rotation = T_camera_object[:3, :3].astype(np.float64)
+    eye = (-rotation.T @ T_camera_object[:3, 3] - model.origin) / model.voxel_size
+    directions = rays.astype(np.float64) @ rotation / model.voxel_size
+    directions = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+    surface = np.zeros(model.occupancy.shape, bool)
+    surface[tuple(model.surface_index.T)] = True
+    depth = np.full(len(rays), np.inf)
+    from_eye = model.surface_index + 0.5 - eye
+    for ray, cube in _pairs(from_eye, directions):
+        np.minimum.at(depth, ray, _surface_hit(model, cube, from_eye[cube], directions[ray], near))
+    from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
+    for ray, cube in _pairs(from_eye, directions):
+        np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], near))
+    return depth
+
+
+def _pairs(
+    from_eye: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "P 3"]
+) -> Iterator[tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]]:
+    """Rays and unit cubes that may meet, in parts: no cube ahead whose corner is near enough is left out."""
+    if not len(from_eye):
+        return
+    distance = np.linalg.norm(from_eye, axis=1)
+    close = distance.min() <= 2 * _CORNER  # then anything may meet
+    tree = None if close else cKDTree(from_eye / distance[:, None])
+    chord = 2 * np.sin(0.5 * np.arcsin(_CORNER / max(distance.min(), 2 * _CORNER)))
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    for first in range(0, len(unit), _AT_A_TIME):
+        some = unit[first : first + _AT_A_TIME]
+        found = [np.arange(len(from_eye))] * len(some) if tree is None else tree.query_ball_point(some, chord)
+        yield first + np.repeat(np.arange(len(some)), [len(f) for f in found]), np.concatenate(found).astype(int)
+
+
+def _cube(from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Where a ray enters and leaves a unit cube."""
+    ends = np.stack([(from_eye - 0.5) / direction, (from_eye + 0.5) / direction])
+    return ends.min(0).max(-1), ends.max(0).min(-1)
+
+
+def _interior_hit(
+    from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"], near: float
+) -> Float[np.ndarray, "N"]:
+    enter, leave = _cube(from_eye, direction)
+    return np.where((enter <= leave) & (enter > near), enter, np.inf)
+
+
+def _surface_hit(
+    model: ObjectModel,
+    voxel: Int[np.ndarray, "N"],
+    from_eye: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "N 3"],
+    near: float,
+) -> Float[np.ndarray, "N"]:
+    normal = model.surface_normal[voxel]
+    enter, leave = _cube(from_eye, direction)
+    facing = (normal * direction).sum(-1)
+    facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
+    offset = model.surface_offset[voxel] / model.voxel_size
+    meet = (offset + (normal * from_eye).sum(-1)) / facing
+    reach = np.abs(meet[:, None] * direction - from_eye).max(-1)
+    met = (enter <= leave) & (reach <= 0.5 + INFLATION) & (meet > near)
+    return np.where(met, meet, np.inf)

@@ -1,0 +1,123 @@
+"""Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.likelihood.density import Noise, Pixels, log_likelihood
+from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
+from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.march import march
+from bayes3d_ros.likelihood.scored_image import Image, observed
+from bayes3d_ros.likelihood.tiled_render import crop, draw_tiles, over_depth, padding
+from bayes3d_ros.likelihood.tiles import LARGE, Tiles, tiles_of_objects
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+
+
+def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
+    pad = [(0, 0)] * (depth.ndim - 2) + [padding(window // 2, LARGE)] * 2
+    return jnp.pad(depth, pad, constant_values=jnp.inf)
+
+
+def _drawn(contact: Contact, library: LibraryArrays, table: Table) -> Drawn:
+    """An object each."""
+    T = T_camera_object(contact, library, table)
+    return Drawn(contact.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
+
+
+def _drawing(contact: Contact, image: Image, library: LibraryArrays, table: Table) -> tuple[Callable, Callable]:
+    """Draws object n along rays; tiles of the objects' outlines, grown by so many pixels."""
+    T = T_camera_object(contact, library, table)
+
+    def draw(n, rays):
+        return march(library, contact.type[n], T[n], rays)
+
+    def tiles(grown: int) -> Tiles:
+        return tiles_of_objects(T[:, None], contact.type[:, None], image, library, grown)
+
+    return draw, tiles
+
+
+def _twice(pixels: Pixels) -> Pixels:
+    """For two scenes' tiles one after the other."""
+
+    def both(a: Array) -> Array:
+        layers = a.reshape(*a.shape[:2], -1, 1, LARGE.chunk)
+        return jnp.concatenate([layers, layers], 3).reshape(*a.shape[:2], -1)
+
+    depth, kind, ray_x, ray_y = (both(a) for a in (pixels.depth, pixels.kind, pixels.ray_x, pixels.ray_y))
+    beside = jax.tree.map(both, pixels.beside)
+    return pixels._replace(depth=depth, kind=kind, ray_x=ray_x, ray_y=ray_y, beside=beside)
+
+
+@partial(jax.jit, static_argnames="window")
+def log_likelihood_gain(
+    contact: Contact,
+    ancestor: Int[Array, "N"],
+    scenes: Float[Array, "A Hp Wp"],
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+    noise: Noise,
+    window: int,
+) -> Float[Array, "N S P"]:
+    """log p(image | scene and object) - log p(image | scene) for each hypothesis and every (sigma, p_outlier).
+
+    scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
+    """
+    if gain_of := kernel(image):
+        drawn = _drawn(contact, library, table)
+        return gain_of(drawn, Scenes(scenes, ancestor), image, library, noise, window)
+    half, (tile, chunk) = window // 2, LARGE
+    draw, tiles = _drawing(contact, image, library, table)
+
+    def add(gains, n, u, v, depth, real):
+        before = crop(scenes, ancestor[n], u, v, tile + 2 * half)
+        # Both at once, as twice the tiles: half the code to compile and to load.
+        both = jnp.concatenate([before, jnp.minimum(before, depth)], -1)
+        value = log_likelihood(both, _twice(observed(image, u, v, (tile, tile))), noise, window)
+        gain = value[..., chunk:] - value[..., :chunk]
+        return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
+
+    count = len(contact.type)
+    gains = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    return over_depth(add, gains, draw, tiles(0), tiles(half), count, image, half, LARGE)
+
+
+@partial(jax.jit, static_argnames="window")
+def draw_objects(
+    contact: Contact,
+    scenes: Float[Array, "N Hp Wp"],
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+    window: int,
+) -> Float[Array, "N Hp Wp"]:
+    """Scene n with object n rendered into it."""
+    if depth := depth_kernel():
+        return depth(_drawn(contact, library, table), scenes, image, library, window // 2)
+    draw, tiles = _drawing(contact, image, library, table)
+    drawn = tiles(0)
+    each = drawn.u.shape[0] // len(scenes)
+    return draw_tiles(draw, scenes, drawn, (0, drawn.u.shape[0]), each, image, window // 2, LARGE)
+
+
+def log_likelihood_scene(
+    scenes: Float[Array, "A Hp Wp"], image: Image, noise: Noise, window: int
+) -> Float[Array, "A S P"]:
+    """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
+    height, width = image.depth.shape
+    half = window // 2
+    # One tile, grown by pixels without a return to a multiple of four of them.
+    tall, wide = height, width + -width % 4
+    pixels = observed(image, jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32), (tall, wide))
+
+    def one(scene: Float[Array, "Hp Wp"]) -> Float[Array, "S P"]:
+        rendered = scene[: tall + 2 * half, : wide + 2 * half, None]
+        return log_likelihood(rendered, pixels, noise, window, image.rows)[..., 0]
+
+    return jax.lax.map(one, scenes)

@@ -1,1 +1,0 @@
-"""What the world is: objects, scenes, how they render, how likely an image is."""

@@ -1,0 +1,1 @@
+"""What an object is: voxel models, libraries of them, and how an object stands on a table."""

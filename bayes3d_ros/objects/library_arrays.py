@@ -1,0 +1,168 @@
+"""A library as padded arrays: what compiled code sees. Shapes depend on padded sizes only, so that a library can
+gain an object without a recompilation."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from bayes3d_ros.objects.empty_boxes import empty_boxes
+from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
+from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
+from bayes3d_ros.objects.self_symmetry import lookalikes
+
+NUM_FACES = 6
+OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
+INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
+SKETCH_POINTS = 96  # surface points a type, for the coarse score
+EMPTY = -127 << 24  # words below are those of empty voxels
+SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
+_TYPE_PAD, _VOXEL_PAD = 4, 1 << 19
+
+
+class LibraryArrays(NamedTuple):
+    """K types (padded), V voxels of all grids laid end to end.
+
+    A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8, -127 the least) and offset (int8); an
+    empty voxel holds -128 and the sides of the empty box ahead (`empty_boxes.py`); one inside the solid is all zeros.
+    Every grid is there eight times, once for each octant of directions.
+    """
+
+    num_types: Int[Array, ""]
+    words: Int[Array, "V"]
+    first: Int[Array, "K"]  # index of the type's first voxel
+    dims: Int[Array, "K 3"]
+    voxel_size: Float[Array, "K"]
+    origin: Float[Array, "K 3"]
+    T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
+    face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
+    hull_corner: Float[Array, "K 3 C"]  # of a convex solid around all that rays meet (`hull.py`), object frame
+    hull_count: Int[Array, "K"]  # how many those are; the rest repeats one of them
+    radius: Float[Array, "K"]  # of a ball about the box centre
+    sketch: Float[Array, "K P 3"]  # surface points, object frame
+    sketch_normal: Float[Array, "K P 3"]
+    sketch_area: Float[Array, "K"]  # metres^2 that one of them stands for
+    solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
+    alike_face: Int[Array, "K 6 A"]  # contacts that look like each other (`self_symmetry.py`)
+    alike_shift: Float[Array, "K 6 A 3"]  # along the contact's own x and y, and yaw
+
+
+def contact_transform(model: ObjectModel, face: int) -> Float[np.ndarray, "4 4"]:
+    """T_contact_object: contact_normal[face] turned to -z, lowest point at z = 0, box centre above the origin.
+
+    The free rotation about z is fixed by turning the box axis that follows the face's own axis to +x.
+    """
+    down = model.contact_normal[face].astype(np.float64)
+    z = -down / np.linalg.norm(down)
+    x = model.T_object_box[:3, (face // 2 + 1) % 3]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    centre = rotation @ model.T_object_box[:3, 3]
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = [-centre[0], -centre[1], model.contact_height[face]]
+    return transform
+
+
+def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
+    """Extent of the face along the contact frame's x and y, in metres."""
+    axis = face // 2
+    return model.box_size[[(axis + 1) % 3, (axis + 2) % 3]]
+
+
+def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
+    """The model's grid as 32-bit words (see LibraryArrays)."""
+    solid = _solid(model)
+    boxes = empty_boxes(solid).astype(np.uint32)
+    words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
+    normal, offset = _planes(model)
+    plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
+    words[:, *model.surface_index.T] = plane
+    return words.view(np.int32)
+
+
+def _planes(model: ObjectModel) -> tuple[Int[np.ndarray, "S 3"], Int[np.ndarray, "S"]]:
+    """The surface's normals, 127 long, and offsets, 127 of which are OFFSET_RANGE voxels."""
+    normal = np.rint(model.surface_normal * 127).astype(np.int64)
+    offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
+    return normal, offset
+
+
+def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
+    """A convex solid around all that rays can meet, in voxels: planes in their inflated cubes, and voxels inside."""
+    inside = model.occupancy.copy()
+    inside[tuple(model.surface_index.T)] = False
+    normal, offset = _planes(model)
+    planes = patch_corners(model.surface_index, normal / 127, offset / 127 * OFFSET_RANGE, 0.5 + INFLATION)
+    return hull(np.concatenate([planes, cube_corners(np.argwhere(inside))]))
+
+
+def library_arrays(library: Library) -> LibraryArrays:
+    """Pack a library for the device, padded to a few sizes."""
+    models = library.models
+    count = len(models)
+    padded = -(-count // _TYPE_PAD) * _TYPE_PAD
+    sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
+    hulls = [m.origin + _hull(m) * m.voxel_size for m in models]
+    grids = [pack_voxels(m).ravel() for m in models]
+    T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
+    alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
+    first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
+    if first[-1] > np.iinfo(np.int32).max:
+        raise LibraryError(f"the library has {first[-1] // 8} voxels; {np.iinfo(np.int32).max // 8} can be addressed")
+    words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
+    words[: first[-1]] = np.concatenate(grids)
+
+    def stack(rows: Sequence[np.ndarray | np.floating], dtype: type = np.float32) -> Array:
+        rows = [*rows, *[rows[0]] * (padded - count)]
+        return jnp.asarray(np.stack(rows).astype(dtype))
+
+    return LibraryArrays(
+        num_types=jnp.int32(count),
+        words=jnp.asarray(words),
+        first=stack(list(first[:count]), np.int32),
+        dims=stack([np.array(m.occupancy.shape) for m in models], np.int32),
+        voxel_size=stack([np.float32(m.voxel_size) for m in models]),
+        origin=stack([m.origin for m in models]),
+        T_contact_object=stack(T_contact_object),
+        face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
+        hull_corner=stack([np.pad(h, ((0, MOST_CORNERS - len(h)), (0, 0)), "edge").T for h in hulls]),
+        hull_count=stack([np.array(len(h)) for h in hulls], np.int32),
+        radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
+        sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
+        sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),
+        sketch_area=stack([np.float32(len(m.surface_index) * m.voxel_size**2 / SKETCH_POINTS) for m in models]),
+        solid=stack([p[_spread(p, SOLID_POINTS)] for p in map(_inside, models)]),
+        alike_face=stack([a.face for a in alike], np.int32),
+        alike_shift=stack([a.shift for a in alike]),
+    )
+
+
+def _solid(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:
+    """The voxels that are of the solid or hold some of its surface."""
+    solid = model.occupancy.copy()
+    solid[tuple(model.surface_index.T)] = True
+    return solid
+
+
+def _inside(model: ObjectModel) -> Float[np.ndarray, "Q 3"]:
+    """Centres of the voxels of the solid."""
+    return model.origin + (np.argwhere(model.occupancy) + 0.5) * model.voxel_size
+
+
+def _spread(points: Float[np.ndarray, "S 3"], count: int) -> Int[np.ndarray, "count"]:
+    """Indices of `count` points spread evenly (farthest-point order, so that a prefix is spread evenly too)."""
+    if len(points) <= count:
+        return np.arange(count) % len(points)
+    pool = np.linspace(0, len(points) - 1, min(len(points), 20 * count)).astype(int)
+    points = points[pool]
+    chosen = np.empty(count, int)
+    chosen[0] = np.argmin(((points - points.mean(0)) ** 2).sum(1))
+    distance = np.full(len(points), np.inf)
+    for i in range(1, count):
+        distance = np.minimum(distance, ((points - points[chosen[i - 1]]) ** 2).sum(1))
+        chosen[i] = distance.argmax()
+    return pool[chosen]

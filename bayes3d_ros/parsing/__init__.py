@@ -1,0 +1,1 @@
+"""From one depth frame to a posterior over scenes. `parser.py` is the way in."""

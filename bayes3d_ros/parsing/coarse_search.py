@@ -1,0 +1,230 @@
+"""The coarse level: score every (type, face, yaw, x, y) cell with a sketch of the object, a few points of its surface.
+
+A sketch point is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;
+where the camera sees past it, against; where something hides it, or nothing returned, it says nothing. Scores only
+choose where to look closer: they need not be right, and the sampler's weights are exact whatever they are.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from bayes3d_ros.likelihood.density import NO_RETURN
+from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
+from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+
+CELL = 0.02  # metres
+YAWS = 24
+MAX_CELLS = 512
+_BLOCK = 4  # cells a step
+# Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
+_COARSE = (0.02, 0.5, 36)  # tolerance, penalty, points
+_REACH = 3  # cells: how far from unexplained returns an object's centre is looked for
+_NATS = 8.0  # what a pixel explained is worth, roughly
+
+
+class Evidence(NamedTuple):
+    """What is left to explain: for each pixel its depth and how unexplained its return is (1 wholly, 0 not)."""
+
+    depth: Float[Array, "H W"]
+    unexplained: Float[Array, "H W"]
+    explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
+
+
+def sketch_score(
+    contact: Contact,
+    evidence: Evidence,
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+    tolerance: float,
+    penalty: float,
+    points: int,
+) -> Float[Array, "N"]:
+    """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
+    past, relative to the reward of one that matches; the first `points` of the sketch are used."""
+    T = T_camera_object(contact, library, table)
+    point, normal = _placed(T, contact.type, library, points)
+    return _score(point, normal, _area(library, points)[contact.type], evidence, image, tolerance, penalty)
+
+
+class _Vectors(NamedTuple):
+    """Components along the camera's axes."""
+
+    x: Float[Array, "N P"]
+    y: Float[Array, "N P"]
+    z: Float[Array, "N P"]
+
+
+def _placed(
+    T: Float[Array, "N 4 4"], kind: Int[Array, "N"], library: LibraryArrays, points: int
+) -> tuple[_Vectors, _Vectors]:
+    """The first `points` of the sketch and their normals in the camera frame."""
+    rotation, translation = T[:, :3, :3], T[:, :3, 3]
+
+    def turned(vectors: Float[Array, "N P 3"]) -> _Vectors:
+        r, (x, y, z) = rotation[..., None], (vectors[..., a] for a in range(3))
+        return _Vectors(*(r[:, a, 0] * x + r[:, a, 1] * y + r[:, a, 2] * z for a in range(3)))
+
+    point = turned(library.sketch[kind, :points])
+    placed = _Vectors(*(along + translation[:, a][:, None] for a, along in enumerate(point)))
+    return placed, turned(library.sketch_normal[kind, :points])
+
+
+def _score(
+    point: _Vectors,
+    normal: _Vectors,
+    area: Float[Array, "N"],
+    evidence: Evidence,
+    image: Image,
+    tolerance: float,
+    penalty: float,
+) -> Float[Array, "N"]:
+    """Rough gain in nats; `area` in metres^2 is what one of the points stands for."""
+    height, width = evidence.depth.shape
+    x, y, z = point
+    facing = jnp.maximum(-(normal.x * x + normal.y * y + normal.z * z), 0.0) * jax.lax.rsqrt(x * x + y * y + z * z)
+    inverse = 1 / jnp.maximum(z, 0.02)
+    u = jnp.round(x * inverse * image.focal[0] + image.centre[0]).astype(jnp.int32)
+    v = jnp.round(y * inverse * image.focal[1] + image.centre[1]).astype(jnp.int32)
+    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    index = jnp.clip(v, 0, height - 1) * width + jnp.clip(u, 0, width - 1)
+    observed = evidence.depth.ravel()[index]
+    # What nothing is known of neither matches nor speaks against.
+    known = jnp.where(seen & (observed > 0), facing * inverse**2, 0.0)
+    gap = observed - z
+    matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * evidence.unexplained.ravel()[index]
+    through = jnp.clip(gap / tolerance - 1, 0.0, 1.0) * evidence.explained.ravel()[index]
+    pixels = area * image.focal[0] * image.focal[1]
+    return _NATS * pixels * ((matched - penalty * through) * known).sum(-1)
+
+
+def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
+    """Cells along x and y of the table's rectangle."""
+    return int(-(-table_size[0] // CELL)), int(-(-table_size[1] // CELL))
+
+
+def cells_to_search(
+    evidence: Evidence, image: Image, table: Table, shape: tuple[int, int]
+) -> tuple[Float[Array, "C 2"], Int[Array, ""]]:
+    """Centres of the cells near unexplained returns, those with the most first, and how many there are."""
+    xy = table_xy(evidence.depth, image, table)
+    index = jnp.floor((xy + table.size / 2) / CELL).astype(jnp.int32)
+    inside = ((index >= 0) & (index < jnp.array(shape))).all(-1)
+    index = jnp.clip(index, 0, jnp.array(shape) - 1)
+    area = jnp.where(inside & (evidence.depth > 0), evidence.unexplained, 0.0)
+    counts = jnp.zeros(shape).at[index[..., 0], index[..., 1]].add(area)
+    size = 2 * _REACH + 1
+    near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
+    best, where = jax.lax.top_k(near.ravel(), min(MAX_CELLS, shape[0] * shape[1]))
+    centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * CELL - table.size / 2
+    return centre, (best >= 8).sum()
+
+
+def table_xy(depth: Float[Array, "H W"], image: Image, table: Table) -> Float[Array, "H W 2"]:
+    """Where each return stands on the table."""
+    R, t = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
+    point = [depth * image.ray_x[None, :] - t[0], depth * image.ray_y[:, None] - t[1], depth - t[2]]
+    return jnp.stack([sum(R[a, b] * point[a] for a in range(3)) for b in range(2)], -1)
+
+
+def score_cells(
+    centres: Float[Array, "C 2"],
+    count: Int[Array, ""],
+    evidence: Evidence,
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+) -> Float[Array, "C K 6 Y"]:
+    """Sketch scores of all cells, -inf where not searched: on CPUs by compiled loops."""
+    if jax.default_backend() != "cpu":
+        return cells_in_turn(centres, count, evidence, image, library, table)
+    from bayes3d_ros.parsing.coarse_search_cpu import sketch_scores  # takes a while to import
+
+    kinds, (face, yaw) = library.first.shape[0], _ways()
+    tolerance, penalty, points = _COARSE
+    shape = (kinds, len(face))
+    kind, face, yaw = (jnp.broadcast_to(a, shape).ravel() for a in (jnp.arange(kinds)[:, None], face, yaw))
+    zero = jnp.zeros(face.shape)
+    T = T_camera_object(Contact(kind, face, zero, zero, yaw), library, table)
+    point, normal = (jnp.stack(v).reshape(3, *shape, points) for v in _placed(T, kind, library, points))
+    scores = sketch_scores(
+        point,
+        normal,
+        _NATS * _area(library, points) * image.focal[0] * image.focal[1],
+        centres @ table.T_camera_table[:3, :2].T,
+        count,
+        library.num_types,
+        *evidence,
+        (image.focal, image.centre),
+        tolerance,
+        penalty,
+    )
+    return scores.reshape(-1, kinds, NUM_FACES, YAWS)
+
+
+def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
+    """Face and yaw of every orientation."""
+    face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
+    return face, (yaw + 0.5) * (2 * jnp.pi / YAWS)
+
+
+def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
+    """Metres^2 that one of the first `points` of a type's sketch stands for."""
+    return library.sketch_area * library.sketch.shape[1] / points
+
+
+def cells_in_turn(
+    centres: Float[Array, "C 2"],
+    count: Int[Array, ""],
+    evidence: Evidence,
+    image: Image,
+    library: LibraryArrays,
+    table: Table,
+) -> Float[Array, "C K 6 Y"]:
+    """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
+    kinds, (face, yaw) = library.first.shape[0], _ways()
+    ways = NUM_FACES * YAWS
+    tolerance, penalty, points = _COARSE
+    blocks = -(-count // _BLOCK)
+    along = [table.T_camera_table[:3, axis] for axis in range(2)]
+
+    def of_kind(kind: Int[Array, ""], scores: Array) -> Array:
+        zero = jnp.zeros(ways)
+        at_origin = Contact(jnp.full(ways, kind), face, zero, zero, yaw)
+        # Turned once for all cells.
+        point, normal = _placed(T_camera_object(at_origin, library, table), at_origin.type, library, points)
+        area = _area(library, points)[kind]
+
+        def of_block(block: Int[Array, ""], scores: Array) -> Array:
+            xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))
+            moved = (xy[:, :1] * along[0] + xy[:, 1:] * along[1])[..., None, None]
+            here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
+            value = _score(here, normal, area, evidence, image, tolerance, penalty)
+            value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
+            return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
+
+        return jax.lax.fori_loop(0, blocks, of_block, scores)
+
+    scores = jnp.full((centres.shape[0], kinds, NUM_FACES, YAWS), -jnp.inf)
+    return jax.lax.fori_loop(0, library.num_types, of_kind, scores)
+
+
+def hidden_cells(image: Image, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:
+    """How little the image says of something small in each cell: 1 where it would be hidden, falling with the number of
+    heights above the cell at which the camera sees past."""
+    heights = jnp.array([0.01, 0.02, 0.035, 0.05, 0.07])
+    x = (jnp.arange(shape[0]) + 0.5) * CELL - table.size[0] / 2
+    y = (jnp.arange(shape[1]) + 0.5) * CELL - table.size[1] / 2
+    grid = jnp.stack(jnp.meshgrid(x, y, heights, indexing="ij"), -1)
+    point = (table.T_camera_table[:3, :3] * grid[..., None, :]).sum(-1) + table.T_camera_table[:3, 3]
+    z = jnp.maximum(point[..., 2], 0.02)
+    uv = jnp.round(point[..., :2] / z[..., None] * image.focal + image.centre).astype(jnp.int32)
+    height, width = image.depth.shape
+    seen = ((uv >= 0) & (uv < jnp.array([width, height]))).all(-1) & (point[..., 2] > 0.02)
+    u, v = jnp.clip(uv[..., 0], 0, width - 1), jnp.clip(uv[..., 1], 0, height - 1)
+    past = seen & (image.kind[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
+    return jnp.exp(-1.5 * past.sum(-1))

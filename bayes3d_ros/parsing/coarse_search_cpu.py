@@ -1,0 +1,185 @@
+"""The coarse level of the search (`coarse_search.py`) by loops that numba compiles, for CPUs.
+
+All that is compiled stands in this file: numba looks no further to see whether what it has on disk is up to date.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numba import cfunc, njit, types
+
+from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
+
+_TARGET = "bayes3d_sketch_scores"  # to XLA
+_AT_ONCE = 8  # sketches: their points stay in the first-level cache, and are a multiple of a vector
+_NEAREST, _FARTHEST = 0.02, 1e6  # metres
+
+f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/loops.py`
+_FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
+_allocates = njit(cache=True, nogil=True, error_model="numpy")
+_lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
+
+
+def sketch_scores(
+    point: Float[Array, "3 K Y P"],
+    normal: Float[Array, "3 K Y P"],
+    worth: Float[Array, "K"],
+    moved: Float[Array, "C 3"],
+    count: Int[Array, ""],
+    num_types: Int[Array, ""],
+    depth: Float[Array, "H W"],
+    unexplained: Float[Array, "H W"],
+    explained: Float[Array, "H W"],
+    camera: tuple[Float[Array, "2"], Float[Array, "2"]],
+    tolerance: float,
+    penalty: float,
+) -> Float[Array, "C K Y"]:
+    """Scores of sketches of Y orientations of each type, moved to each of the first `count` places, -inf for other
+    places and types. `worth` is what a point explained is worth at 1 m; `camera` is focal length and centre."""
+    known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST), 0.0, _FARTHEST)
+    focal, centre = camera
+    inputs = (
+        *(a.astype(jnp.float32).ravel() for a in (point, normal, worth, moved, known, unexplained, explained)),
+        jnp.stack([*focal, *centre, *jnp.float32([tolerance, penalty])]),
+        jnp.stack([*jnp.int32([*depth.shape, *point.shape[1:]]), count, num_types]).astype(jnp.int32),
+    )
+    result = jax.ShapeDtypeStruct((moved.shape[0], *point.shape[1:3]), jnp.float32)
+    return jax.ffi.ffi_call(_TARGET, result, vmap_method="sequential")(*inputs)
+
+
+class _Image(NamedTuple):
+    """What is left to explain, and the camera."""
+
+    depth: Float[np.ndarray, "H*W"]
+    unexplained: Float[np.ndarray, "H*W"]
+    explained: Float[np.ndarray, "H*W"]
+    height: int
+    width: int
+    focal_x: float
+    focal_y: float
+    centre_x: float
+    centre_y: float
+    tolerance: float
+    penalty: float
+
+
+class _Points(NamedTuple):
+    """Points of a few sketches, side by side."""
+
+    pixel: Int[np.ndarray, "S"]
+    z: Float[np.ndarray, "S"]
+    area: Float[np.ndarray, "S"]  # that one covers in the image, as a share of that at 1 m; 0 outside
+    observed: Float[np.ndarray, "S"]
+    unexplained: Float[np.ndarray, "S"]
+    explained: Float[np.ndarray, "S"]
+
+
+@_allocates
+def _new_points(size):
+    real = np.zeros(size, np.float32)
+    return _Points(np.zeros(size, np.int32), real, real.copy(), real.copy(), real.copy(), real.copy())
+
+
+@_lanes
+def _project(point, normal, first, count, stride, x0, y0, z0, image, points):
+    """The pixels that points fall into, moved by (x0, y0, z0)."""
+    zero, one, half = f32(0.0), f32(1.0), f32(0.5)
+    pixel, depth, area = points.pixel, points.z, points.area
+    width, height = f32(image.width), f32(image.height)
+    first, second = u64(first), u64(stride)
+    third = second + second
+    for k in range(u64(count)):
+        at = first + k
+        x, y, z = point[at] + x0, point[at + second] + y0, point[at + third] + z0
+        towards = -(normal[at] * x + normal[at + second] * y + normal[at + third] * z)
+        facing = max(towards, zero) / np.sqrt(x * x + y * y + z * z)
+        inverse = one / max(z, f32(_NEAREST))
+        # To the nearest pixel; those outside end up in a frame around the image.
+        u = min(max(x * inverse * image.focal_x + image.centre_x, -one), width)
+        v = min(max(y * inverse * image.focal_y + image.centre_y, -one), height)
+        column, row = i32(u + f32(1.0) + half) - i32(1), i32(v + f32(1.0) + half) - i32(1)
+        seen = (column >= i32(0)) & (column < image.width) & (row >= i32(0)) & (row < image.height)
+        pixel[k] = row * image.width + column if seen else i32(0)
+        depth[k] = z
+        area[k] = facing * inverse * inverse if seen else zero
+
+
+@_lanes
+def _look_up(image, points, count):
+    pixel, observed, unexplained, explained = points.pixel, points.observed, points.unexplained, points.explained
+    for k in range(u64(count)):
+        at = u64(pixel[k])
+        observed[k], unexplained[k], explained[k] = image.depth[at], image.unexplained[at], image.explained[at]
+
+
+@_lanes
+def _weigh(image, points, count):
+    """What each point counts, for or against, in place of its area."""
+    zero, one = f32(0.0), f32(1.0)
+    area, z, observed, unexplained, explained = (
+        points.area,
+        points.z,
+        points.observed,
+        points.unexplained,
+        points.explained,
+    )
+    inverse = one / image.tolerance
+    for k in range(u64(count)):
+        gap = (observed[k] - z[k]) * inverse
+        matched = max(one - gap * gap, zero) * unexplained[k]
+        through = min(max(gap - one, zero), one) * explained[k]
+        area[k] = (matched - image.penalty * through) * area[k] if observed[k] > zero else zero
+
+
+@_lanes
+def _sum(area, first, count):
+    total, first = f32(0.0), u64(first)
+    for k in range(first, first + u64(count)):
+        total += area[k]
+    return total
+
+
+@_lanes
+def _score(point, normal, worth, moved, image, kinds, ways, size, count, num_types, points, scores):
+    for k in range(u64(len(scores))):
+        scores[k] = f32(-np.inf)
+    stride = kinds * ways * size
+    for kind in range(num_types):
+        for way in range(0, ways, _AT_ONCE):
+            some = min(_AT_ONCE, ways - way)
+            first, full = (kind * ways + way) * size, some * size
+            for place in range(count):
+                _project(
+                    point, normal, first, full, stride, moved[3 * place], moved[3 * place + 1], moved[3 * place + 2],
+                    image, points,
+                )  # fmt: skip
+                _look_up(image, points, full)
+                _weigh(image, points, full)
+                to = (place * kinds + kind) * ways + way
+                for k in range(some):
+                    scores[to + k] = worth[kind] * _sum(points.area, k * size, size)
+
+
+@cfunc(types.int64(types.int64), cache=True)
+def _sketch(frame):
+    """See `sketch_scores`."""
+    if answered_version(frame):
+        return 0
+    numbers, sizes = floats(frame, 7), integers(frame, 8)
+    places, kinds = min(sizes[5], i32(len(floats(frame, 3)) // 3)), min(sizes[6], sizes[2])
+    image = _Image(
+        floats(frame, 4), floats(frame, 5), floats(frame, 6), sizes[0], sizes[1],
+        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
+    )  # fmt: skip
+    _score(
+        floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), image, np.int64(sizes[2]),
+        np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(kinds),
+        _new_points(_AT_ONCE * sizes[4]), float_results(frame, 0),
+    )  # fmt: skip
+    return 0
+
+
+register(_TARGET, _sketch)

@@ -1,0 +1,235 @@
+"""The fine levels: follow modes of the likelihood uphill, learn their shapes, and make a mixture that fits."""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+from bayes3d_ros.objects.placement import Contact, Table, log_prior, shifted
+from bayes3d_ros.objects.self_symmetry import ALIKE
+from bayes3d_ros.parsing.proposal import Modes, draw_modes, log_density_modes, refit
+from bayes3d_ros.sampling.resampling import effective_fraction
+
+Tree = TypeVar("Tree")
+_DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
+_PILOT_ROUNDS, PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
+FINALISTS = 4
+COMPONENTS = FINALISTS * (1 + ALIKE)
+_INFLATION, _FLATTEN = 1.5, 4.0
+# In the pilots' word on masses, which rests on few of them: of the modes of a type, and of the types.
+_TRUST, _TRUST_TYPES = 0.5, 0.3
+_EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find
+_PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
+_SMALLEST_SPREAD, _LARGEST_SPREAD = (2e-5, 2e-5, 2e-4), (0.05, 0.05, 2.0)  # metres, metres, radians
+
+
+class Hypotheses(NamedTuple):
+    """Objects, with how far off in (x, y, yaw) each may be."""
+
+    contact: Contact  # [N]
+    scale: Float[Array, "N 3 3"]  # lower Cholesky factor of the covariance
+
+
+class Pilots(NamedTuple):
+    """Draws that a mixture was fitted to, once they told what they could."""
+
+    contact: Contact  # [D]
+    log_target: Float[Array, "D"]  # up to a constant
+    log_drawn: Float[Array, "D"]  # log density of what drew them
+
+
+def take(tree: Tree, index: Array | slice) -> Tree:
+    return jax.tree.map(lambda a: a[index], tree)
+
+
+def best_first(tree: Tree, score: Float[Array, "N"], count: int) -> tuple[Tree, Float[Array, "count"]]:
+    best, index = jax.lax.top_k(score, count)
+    return take(tree, index), best
+
+
+def factor(covariance: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
+    """Lower Cholesky factors of covariances in (x, y, yaw) that float32 may have made slightly indefinite."""
+    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), jnp.array(_SMALLEST_SPREAD) ** 2))
+    correlation = covariance / (spread[:, :, None] * spread[:, None, :])
+    return spread[:, :, None] * jnp.linalg.cholesky(correlation + 1e-5 * jnp.eye(3))
+
+
+def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
+    """Scales of a size that a mode may have: one that followed a ridge without end must not grow without end."""
+    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(_SMALLEST_SPREAD)), scale)
+    excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(_LARGEST_SPREAD)).max(1)
+    return scale / jnp.maximum(excess, 1)[:, None, None]
+
+
+def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M D"]:
+    """Weights exp(beta v), normalised along the last axis, with beta <= 1 as large as keeps `effective` samples."""
+
+    def weights(beta: Float[Array, "M"]) -> Float[Array, "M D"]:
+        return jax.nn.softmax(beta[:, None] * log_value, -1)
+
+    def halve(bounds, _):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        enough = 1 / (weights(jnp.exp(middle)) ** 2).sum(-1) >= effective
+        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
+
+    start = (jnp.full(log_value.shape[0], -16.0), jnp.zeros(log_value.shape[0]))
+    (low, _), _ = jax.lax.scan(halve, start, None, length=14)
+    return weights(jnp.exp(low))
+
+
+def _draw_about(contact: Contact, offset: Float[Array, "M D 3"]) -> Contact:
+    """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
+    count = offset.shape[1]
+    return Contact(
+        jnp.repeat(contact.type[:, None], count, 1),
+        jnp.repeat(contact.face[:, None], count, 1),
+        contact.x[:, None] + offset[..., 0],
+        contact.y[:, None] + offset[..., 1],
+        contact.yaw[:, None] + offset[..., 2],
+    )
+
+
+def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
+    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
+
+
+def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypotheses, Float[Array, "M"]]:
+    """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
+    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes
+    and theirs."""
+
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
+        contact, scale = state
+        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
+        offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
+        value = gains(jax.tree.map(jnp.ravel, _draw_about(contact, offset))).reshape(offset.shape[:2])
+        value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
+        weight = _temper(value, 5.0)
+        centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
+        learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
+        best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
+        floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
+        covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
+        return Hypotheses(_move(contact, best), factor(covariance)), value.max(1)
+
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))
+    return modes, values[-1]
+
+
+def sharpen(
+    key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
+) -> tuple[Hypotheses, Float[Array, "M"]]:
+    """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
+    mode's covariance. Returns the modes and the best log likelihood met."""
+
+    def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
+        contact, scale = state
+        step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
+        about = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
+        value = gains(jax.tree.map(jnp.ravel, about)).reshape(step.shape[:2])
+        value = jnp.maximum(value, -1e9)
+        best = jnp.argmax(value, 1)
+        height = value - value.max(1, keepdims=True)
+        weight = _temper(height, 0.6 * draws)
+        i, j = jnp.triu_indices(3)
+        square = step[..., i] * step[..., j] * jnp.where(i == j, 0.5, 1.0)
+        features = jnp.concatenate([jnp.ones_like(step[..., :1]), step, square], -1)
+        gram = jnp.einsum("md,mda,mdb->mab", weight, features, features) + 1e-4 * jnp.eye(10)
+        target = jnp.einsum("md,mda,md->ma", weight, features, jnp.maximum(height, -1e5))
+        fit = jnp.linalg.solve(gram, target[..., None])[..., 0]
+        slope = fit[:, 1:4]
+        upper = jnp.zeros((len(fit), 3, 3)).at[:, i, j].set(fit[:, 4:])
+        curvature = upper + upper.transpose(0, 2, 1) - upper * jnp.eye(3)
+        value_along, along = jnp.linalg.eigh(-curvature)
+        value_along = jnp.clip(value_along, 0.15, 1e4)
+        top = jnp.einsum("mab,mb,mcb,mc->ma", along, 1 / value_along, along, slope)
+        top = top / jnp.maximum(1, jnp.linalg.norm(top, axis=1, keepdims=True) / 2.5)
+        # Where the fit's top lies far from the best draw, trust the draw.
+        seen = jnp.take_along_axis(step, best[:, None, None], 1)[:, 0]
+        off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
+        top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
+        inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
+        moved = _move(contact, jnp.einsum("mab,mb->ma", scale, top))
+        return Hypotheses(moved, _bounded(scale @ jnp.linalg.cholesky(inverse))), value.max(1)
+
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
+    return modes, values[-1]
+
+
+def adapt(
+    key: PRNGKeyArray, modes: Modes, gains: Callable, library: LibraryArrays, table: Table
+) -> tuple[Modes, Pilots]:
+    """Refit the mixture to weighted draws from itself until their weights are even enough. The draws are thrown away:
+    the sampler's own come after, so that nothing is chosen by its weight."""
+
+    def pilot(key: PRNGKeyArray, modes: Modes) -> tuple[Modes, Pilots, Array]:
+        wide = modes._replace(scale=_PILOT_SCALE * modes.scale)
+        draws = draw_modes(key, wide, PILOT_DRAWS)
+        log_target = gains(draws) + log_prior(draws, library, table)
+        log_drawn = jax.nn.logsumexp(log_density_modes(draws, wide), 1)
+        log_weight = log_target - log_drawn
+        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
+        weight = _temper(log_weight[None], _PILOT_ESS * PILOT_DRAWS)[0]
+        # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
+        component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)
+        mass = jax.nn.logsumexp(component + log_weight[:, None], 0)
+        share = jnp.logaddexp(log_shares(mass, modes.centre.type), jnp.log(0.03 / len(mass)))
+        fitted = refit(draws, weight, modes)._replace(log_weight=jax.nn.log_softmax(share))
+        return fitted, Pilots(draws, log_target, log_drawn), effective_fraction(log_weight)
+
+    def unfit(state: tuple) -> Array:
+        trial, _, _, ess = state
+        return (trial < _PILOT_ROUNDS) & (ess < _PILOT_ESS)
+
+    def again(state: tuple) -> tuple:
+        trial, modes, _, _ = state
+        return trial + 1, *pilot(jax.random.fold_in(key, trial), modes)
+
+    unknown = jnp.zeros(PILOT_DRAWS)
+    none_yet = Pilots(draw_modes(key, modes, PILOT_DRAWS), unknown, unknown)
+    _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (0, modes, none_yet, jnp.float32(0.0)))
+    return modes, pilots
+
+
+def log_shares(mass: Float[Array, "M"], kind: Int[Array, "M"]) -> Float[Array, "M"]:
+    """Log shares of draws for modes of these log masses and types: flatter than the masses, and flatter yet between
+    types. However many modes the likely type has, another of a few percent is drawn often enough to be weighed."""
+    same = kind[:, None] == kind
+    mass = jnp.maximum(mass, mass.max() - 1e4)  # a type of which no pilot was drawn
+
+    def of_type(value: Float[Array, "M"]) -> Float[Array, "M"]:
+        return jax.nn.logsumexp(jnp.where(same, value, -jnp.inf), 1)
+
+    return jax.nn.log_softmax(_TRUST_TYPES * of_type(mass) + _TRUST * mass - of_type(_TRUST * mass))
+
+
+def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
+    """Each component and the poses where its object looks alike (`self_symmetry.py`), sharing its weight by their log
+    likelihoods: a search that found one of them need not have found the others."""
+    at, scale = modes.centre, modes.scale
+    face = jnp.concatenate([at.face[:, None], library.alike_face[at.type, at.face]], 1)
+    shift = library.alike_shift[at.type, at.face]
+    shift = jnp.concatenate([jnp.zeros_like(shift[:, :1]), shift], 1)
+    centre = shifted(jax.tree.map(lambda a: jnp.broadcast_to(a[:, None], face.shape), at), face, shift)
+    dx, dy = centre.x - at.x[:, None], centre.y - at.y[:, None]
+    # A turn of one carries the middle of the other around.
+    zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
+    rows = [jnp.stack(row, -1) for row in ((one, zero, -dy), (zero, one, dx), (zero, zero, one))]
+    carried = jnp.einsum("maij,mjk->maik", jnp.stack(rows, -2), scale).reshape(-1, 3, 3)
+    value = jnp.maximum(gains(jax.tree.map(jnp.ravel, centre)), -1e9).reshape(face.shape)
+    share = jnp.logaddexp(jax.nn.log_softmax(value / 2, 1), jnp.log(0.03 / face.shape[1]))
+    weight = jax.nn.log_softmax((modes.log_weight[:, None] + share).ravel())
+    return Modes(jax.tree.map(jnp.ravel, centre), factor(carried @ carried.swapaxes(1, 2)), weight)
+
+
+def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
+    """A mixture of the modes, weighted by their log likelihoods and volumes. Flattened: the values are rough, and a
+    mode that is missed costs more than one that is tried in vain."""
+    scale = _INFLATION**0.5 * modes.scale
+    log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
+    log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
+    return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))

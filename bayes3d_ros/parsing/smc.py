@@ -1,0 +1,198 @@
+"""Sequential Monte Carlo over the objects of a scene (Bayes3D, Methodology, B), with the paper's gaps closed.
+
+Stage k carries weighted scenes of k objects towards p_k, the posterior given k objects. The noise variables are
+integrated out of every target (`noise.py`), so none is replaced between stages and W_i needs no kernel for them. Scenes
+are sets: a set of k objects has k! orders, the sampler makes one of them, and the backward kernel says which object
+came last: the one that explains least alone, since the search adds what explains most first.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.likelihood import noise as noise_model
+from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
+from bayes3d_ros.objects.placement import Contact, log_prior
+from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, gain_alone, log_last
+from bayes3d_ros.parsing.coarse_search import cell_grid
+from bayes3d_ros.parsing.mode_search import COMPONENTS
+from bayes3d_ros.parsing.proposal import SHARES, Modes, Proposal, log_density, propose
+from bayes3d_ros.parsing.rejuvenation import Effort, Frame, Scenes, rejuvenate
+from bayes3d_ros.parsing.search import Context, Scene, conflicts, find_proposal
+from bayes3d_ros.parsing.tempering import MOST_LEVELS, TOO_UNEVEN, Extended, longest_step, move_new
+from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
+
+OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
+_MOVES = 2  # once resampled at the target; on the way there one
+
+
+class State(NamedTuple):
+    """N weighted scenes of k objects."""
+
+    objects: Contact  # [N, M]
+    alone: Float[Array, "N M"]  # nats that each object alone gains over the empty table
+    line: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
+    scenes: Float[Array, "N Hp Wp"]  # padded depth
+    table: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
+    log_likelihood: Float[Array, "N"]  # noise integrated out
+    log_weight: Float[Array, "N"]  # normalised
+    log_evidence: Float[Array, ""]  # of k objects, relative to the empty table
+    proposals: Proposal  # [M], of each stage
+    empty: Empty  # the table without any
+
+
+class Info(NamedTuple):
+    """What happened in a stage."""
+
+    ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
+
+
+@partial(jax.jit, static_argnames=("particles", "max_objects", "table_size", "window"))
+def init(
+    context: Context, grid: NoiseGrid, particles: int, max_objects: int, table_size: tuple[float, float], window: int
+) -> State:
+    """The empty table."""
+    empty = empty_table(context, grid, window)
+    slots = (particles, max_objects)
+    none, zero = jnp.full(slots, -1, jnp.int32), jnp.zeros(slots)
+    none_yet = jnp.full((max_objects, COMPONENTS), -1, jnp.int32)
+
+    def everywhere(a: Array) -> Array:
+        return jnp.broadcast_to(a, (particles, *a.shape[1:]))
+
+    return State(
+        objects=Contact(none, none, zero, zero, zero),
+        alone=zero,
+        line=none,
+        scenes=everywhere(empty.scene),
+        table=everywhere(empty.table),
+        log_likelihood=everywhere(empty.log_likelihood),
+        log_weight=jnp.full(particles, -jnp.log(particles), jnp.float32),
+        log_evidence=jnp.float32(0.0),
+        proposals=Proposal(
+            Modes(
+                Contact(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
+                jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
+                jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
+            ),
+            jnp.zeros((max_objects, *cell_grid(table_size))),
+            jnp.zeros((max_objects, len(SHARES))),
+        ),
+        empty=empty,
+    )
+
+
+@partial(jax.jit, static_argnames=("table_size", "window", "ess_threshold"))
+def step(
+    key: PRNGKeyArray,
+    state: State,
+    count: Int[Array, ""],
+    context: Context,
+    grid: NoiseGrid,
+    table_size: tuple[float, float],
+    window: int,
+    ess_threshold: float,
+) -> tuple[State, Info]:
+    """Add an object to scenes that hold `count` of them."""
+    image, library, table = context
+    particles = state.log_weight.shape[0]
+    resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
+    ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
+
+    lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
+    scene = Scene(state.scenes[lead], state.table[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
+    proposal, exponents = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
+
+    def extend(ancestor: Int[Array, "N"], new: Contact) -> Extended:
+        gain = log_likelihood_gain(new, ancestor, state.scenes, *context, grid.coarse, window)
+        summed = state.table[ancestor] + gain
+        log_likelihood = noise_model.log_marginal(summed, grid)
+        log_q = log_density(new, proposal, library, table)
+        log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
+        others = jax.tree.map(lambda a: a[ancestor], state.objects)
+        clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
+        log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
+        return Extended(ancestor, new, summed, log_likelihood, log_q, log_ratio, jnp.arange(particles))
+
+    start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
+    end, log_weight, log_evidence, ess = _anneal(
+        anneal_key, start, log_weight, exponents, extend, proposal, context, ess_threshold
+    )
+    own = jax.lax.cond(
+        count == 0,
+        lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
+        lambda: gain_alone(end.new, state.empty, context, grid, window),
+    )
+    alone = state.alone[end.ancestor].at[:, count].set(own)
+    log_weight, last = normalised(log_weight + log_last(alone, count))
+    ess = jnp.minimum(ess, effective_fraction(log_weight))
+    objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
+    line = state.line[end.ancestor].at[:, count].set(end.line)
+    scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
+    proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
+    return State(
+        objects=objects,
+        alone=alone,
+        line=line,
+        scenes=scenes,
+        table=end.table,
+        log_likelihood=end.log_likelihood,
+        log_weight=log_weight,
+        log_evidence=state.log_evidence + log_evidence + last,
+        proposals=proposals,
+        empty=state.empty,
+    ), Info(ess)
+
+
+@partial(jax.jit, static_argnames=("window", "ess_threshold"))
+def refresh(
+    key: PRNGKeyArray,
+    state: State,
+    count: Int[Array, ""],
+    context: Context,
+    grid: NoiseGrid,
+    window: int,
+    ess_threshold: float,
+    effort: Effort,
+) -> State:
+    """The same posterior of scenes of `count` objects, some of them moved."""
+    scenes = Scenes(*(getattr(state, name) for name in Scenes._fields))
+    frame = Frame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
+    return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
+
+
+def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_threshold):
+    """From draws of the proposal to weighted draws of the target; the log of its evidence and the least ESS met."""
+
+    def going(state: tuple) -> Array:
+        return state[1] < 1.0
+
+    def step(state: tuple) -> tuple:
+        level, b, extended, log_weight, log_evidence, ess = state
+        c = jnp.where(level < MOST_LEVELS - 1, exponents[jnp.argmax(exponents > b)], 1.0)
+        planned = effective_fraction(log_weight + (c - b) * extended.log_ratio)
+        shorter = longest_step(b, c, extended.log_ratio, log_weight)
+        c = jnp.where((planned < TOO_UNEVEN) & (level < MOST_LEVELS - 1), shorter, c)
+        log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
+        now = effective_fraction(log_weight)
+        few = now < ess_threshold
+        level_key = jax.random.fold_in(key, level)
+        extended, log_weight = resample(jax.random.fold_in(level_key, _MOVES), extended, log_weight, ess_threshold)
+
+        def move(number: Array, extended: Extended) -> Extended:
+            move_key, kind = jax.random.fold_in(level_key, number), (level + number) % 3
+            moved = move_new(move_key, extended, c, kind, extend, proposal, context.library, context.table)
+            fresh = (kind == 2) & (moved.new.x != extended.new.x)
+            return moved._replace(line=jnp.where(fresh, moved.line + (level + 1) * len(fresh), extended.line))
+
+        moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
+        extended = jax.lax.fori_loop(0, moves, move, extended)
+        return level + 1, c, extended, log_weight, log_evidence + gained, jnp.minimum(ess, now)
+
+    first = (jnp.int32(0), jnp.float32(0.0), start, log_weight, jnp.float32(0.0), jnp.float32(1.0))
+    _, _, end, log_weight, log_evidence, ess = jax.lax.while_loop(going, step, first)
+    return end, log_weight, log_evidence, ess

@@ -1,0 +1,213 @@
+"""Find the table in a depth image, and tell which returns belong to the workspace."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.posterior.types import ParseError
+
+_INLIER = 0.008  # metres at 1 m, growing with depth squared beyond
+_TRIALS = 400
+_CELL = 0.02  # metres, of the map of the table's support
+_MARGIN = 0.0  # metres, about the hull
+_SMALLEST = 8  # pixels of a piece that counts as standing on the table
+_EDGE = 3  # pixels
+_STANDS = 0.6  # the share of a piece that must be over the table
+_BELOW = 0.02  # metres below the plane that still count as the table
+
+
+class Plane(NamedTuple):
+    """Points x of the plane satisfy normal . x = distance in the camera frame; the normal points to the origin."""
+
+    normal: Float[np.ndarray, "3"]
+    distance: float
+
+
+def _tolerance(z: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    return _INLIER * np.maximum(z**2, 0.5)
+
+
+def find_plane(points: Float[np.ndarray, "N 3"], seed: int = 0) -> Plane:
+    """The dominant plane (sample consensus with a truncated quadratic loss, then least squares on the inliers).
+
+    Returns clearly below a plane count against it, mildly: a table hides what is under it, save beyond its edge.
+    Raises ParseError where no plane holds a tenth of the returns.
+    """
+    if len(points) < 200:
+        raise ParseError(f"no table in sight: only {len(points)} returns in range, expected at least 200")
+    rng = np.random.default_rng(seed)
+    sample = points[rng.permutation(len(points))[:3000]].astype(np.float64)
+    tolerance = _tolerance(sample[:, 2])
+    a, b, c = sample[rng.integers(len(sample), size=(3, _TRIALS))]
+    normal = np.cross(b - a, c - a)
+    norm = np.linalg.norm(normal, axis=1)
+    keep = norm > 1e-3
+    if not keep.any():
+        raise ParseError("no table in sight: the returns do not span a plane")
+    normal = normal[keep] / norm[keep, None]
+    distance = (normal * a[keep]).sum(1)
+    flip = -np.sign(distance)
+    normal, distance = normal * flip[:, None], distance * flip
+    height = (sample @ normal.T - distance) / tolerance[:, None]
+    score = np.maximum(1 - height**2, 0).sum(0) - 0.2 * (height < -3).sum(0)
+    best = int(np.argmax(score))
+    return refine_plane(points, Plane(normal[best], float(distance[best])))
+
+
+def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5) -> Plane:
+    """Weighted least squares with range noise growing as z^2 and a robust (Geman-McClure) loss."""
+    normal, distance = plane
+    for k in range(rounds):
+        height = points @ normal - distance
+        scale = _tolerance(points[:, 2]) / (1 + k)
+        near = np.abs(height) < 3 * scale
+        if near.sum() < 100:
+            raise ParseError(f"no table in sight: the best plane holds {near.sum()} returns, expected at least 100")
+        p, h, s = points[near], height[near], scale[near]
+        weight = 1 / (p[:, 2] ** 4 * (1 + (h / s) ** 2) ** 2)
+        mean = (weight[:, None] * p).sum(0) / weight.sum()
+        spread = np.einsum("n,na,nb->ab", weight, p - mean, p - mean)
+        normal = np.linalg.eigh(spread)[1][:, 0]
+        normal = normal * -np.sign(normal @ mean)
+        distance = float(normal @ mean)
+    held = (np.abs(points @ normal - distance) < _tolerance(points[:, 2])).mean()
+    if held < 0.1:
+        raise ParseError(f"no table in sight: the best plane holds {held:.0%} of the returns, expected at least 10%")
+    return Plane(normal, distance)
+
+
+def table_frame(plane: Plane, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "4 4"]:
+    """T_camera_table: z along the normal, origin where the optical axis meets the table, x to the camera's right.
+
+    Where the axis misses the table, or meets it far behind what is seen, the origin is the middle of what is seen.
+    """
+    z = plane.normal
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    if np.linalg.norm(x) < 1e-3:
+        x = np.array([0.0, 1.0, 0.0]) - z[1] * z
+    x /= np.linalg.norm(x)
+    on_plane = points[np.abs(points @ plane.normal - plane.distance) < _tolerance(points[:, 2])]
+    ahead = plane.distance / z[2] if abs(z[2]) > 1e-3 else np.inf
+    seen = np.percentile(on_plane[:, 2], [2, 98])
+    if seen[0] <= ahead <= seen[1]:
+        origin = np.array([0.0, 0.0, ahead])
+    else:
+        middle = np.median(on_plane, 0)
+        origin = middle - (middle @ z - plane.distance) * z
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    T[:3, 3] = origin
+    return T
+
+
+def workspace(
+    points: Float[np.ndarray, "H W 3"],
+    T_camera_table: Float[np.ndarray, "4 4"],
+    table_size: tuple[float, float],
+    height: float,
+) -> Int[np.ndarray, "H W"]:
+    """The kind of every pixel: IN_WORKSPACE if its return belongs to the table or to what stands on it, BEYOND
+    if to something else, NO_RETURN where the point is NaN or, along the table's edge, where one cannot tell.
+
+    Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from
+    the plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what
+    is seen of the table's surface. (A chair behind the table touches its edge in the image, and a part of it may lean
+    over.) Raises ParseError where nothing of the table is seen.
+    """
+    local = (points - T_camera_table[:3, 3]) @ T_camera_table[:3, :3]
+    z_camera = points[..., 2]
+    with np.errstate(invalid="ignore"):
+        candidate = (local[..., 2] > -_BELOW * np.maximum(1, z_camera**2)) & (local[..., 2] < height)
+        candidate &= (np.abs(local[..., :2]) < np.array(table_size) / 2).all(-1)
+        flat = candidate & (np.abs(local[..., 2]) < _tolerance(z_camera))
+    # The foot of a wall or of an object lies in the plane too: keep what is flat all around.
+    surface = local[ndimage.binary_erosion(flat | np.isnan(z_camera), iterations=2, border_value=1) & flat][:, :2]
+    eye = -T_camera_table[:3, :3].T @ T_camera_table[:3, 3]
+    hull = _support(surface, eye[:2])
+    if hull is None:
+        raise ParseError("no table in sight: nothing is seen of its surface inside the table's area")
+    over = np.zeros(candidate.shape, bool)
+    over[candidate] = hull.find_simplex(local[candidate][:, :2]) >= 0
+    pieces, count = _pieces(candidate & ~flat, z_camera)
+    stands = np.zeros(candidate.shape, bool)
+    if count:
+        share = ndimage.mean(over, pieces, np.arange(count + 1))
+        size = np.bincount(pieces.ravel(), minlength=count + 1)
+        stands = (pieces > 0) & ((share > _STANDS) & (size >= _SMALLEST))[pieces]
+    # The foot of what stands beyond the table's edge is as flat as the table.
+    other = np.isfinite(z_camera) & ~stands & ~(flat & over)
+    table = flat & over & ~ndimage.binary_dilation(other, iterations=_EDGE)
+    return np.where(stands | table, IN_WORKSPACE, np.where(other, BEYOND, NO_RETURN))
+
+
+def table_depth(
+    rays: Float[np.ndarray, "H W 3"], T_camera_table: Float[np.ndarray, "4 4"], far: float
+) -> Float[np.ndarray, "H W"]:
+    """Depth in metres at which rays (x, y, 1) meet the table's plane from above, inf where they do not before `far`."""
+    normal = T_camera_table[:3, 2]
+    facing = rays @ normal
+    with np.errstate(divide="ignore"):
+        depth = (normal @ T_camera_table[:3, 3]) / facing
+    return np.where((facing < -1e-3) & (depth > 0) & (depth < far), depth, np.inf)
+
+
+def usable_share(
+    kind: Int[np.ndarray, "H W"],
+    rays: Float[np.ndarray, "H W 3"],
+    T_camera_table: Float[np.ndarray, "4 4"],
+    table_size: tuple[float, float],
+    far: float,
+) -> float:
+    """Of the pixels whose rays (x, y, 1) meet the table's prior area before `far` metres, the share whose return the
+    likelihood makes use of: as the table's, as that of what stands on it, or as evidence that nothing is in between.
+    NaN where no ray meets it."""
+    bare = table_depth(rays, T_camera_table, far)
+    met = np.isfinite(bare)
+    local = (rays[met] * bare[met, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
+    on_table = (np.abs(local) < np.array(table_size) / 2).all(-1)
+    return float((kind[met][on_table] != NO_RETURN).mean()) if on_table.any() else float("nan")
+
+
+def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:
+    """Pieces of an image connected without a jump in depth."""
+    # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
+    with np.errstate(invalid="ignore"):
+        cut = np.zeros(risen.shape, bool)
+        for axis in (0, 1):
+            step = np.diff(depth, axis=axis)
+            jump = np.abs(step) > 0.03 * np.take(depth, range(1, depth.shape[axis]), axis)
+            later = np.zeros(risen.shape, bool)
+            later[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] = jump
+            cut |= later
+    pieces, count = ndimage.label(risen & ~cut)
+    # Pixels on the cuts join the nearest piece.
+    nearest = ndimage.distance_transform_edt(pieces == 0, return_distances=False, return_indices=True)
+    return np.where(risen, pieces[tuple(nearest)], 0) if count else pieces, count
+
+
+def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> Delaunay | None:
+    """The convex hull of the largest connected piece of surface, grown by a margin and reaching to below the camera:
+    the lower edge of the image is not the edge of the table."""
+    if len(surface) < 50:
+        return None
+    low = surface.min(0)
+    index = ((surface - low) / _CELL).astype(int)
+    counts = np.zeros(index.max(0) + 3, int)
+    np.add.at(counts, tuple(index.T + 1), 1)
+    # Objects cut the visible surface into pieces: bridge gaps of a hand's width.
+    labels, found = ndimage.label(ndimage.binary_dilation(counts > 1, iterations=3))
+    if found == 0:
+        return None
+    sizes = ndimage.sum_labels(counts > 1, labels, np.arange(1, found + 1))
+    piece = labels[tuple(index.T + 1)] == 1 + int(np.argmax(sizes))
+    piece &= counts[tuple(index.T + 1)] > 1
+    ring = _MARGIN * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
+    try:
+        corners = surface[piece][ConvexHull(surface[piece]).vertices]
+        return Delaunay(np.concatenate([(corners[:, None] + ring).reshape(-1, 2), eye[None]]))
+    except (QhullError, ValueError):
+        return None

@@ -1,0 +1,122 @@
+"""From the proposal to the target by steps: resample and move between them (Del Moral et al. 2006).
+
+The likelihood of an object's pose is sharp and uneven; a mixture that fits it well leaves weights that differ by a few
+nats, one that misses something by tens. So an object is not weighted at once but along the path q^(1-b) target^b, b
+from 0 to 1, with Metropolis-Hastings moves at every b. The exponents come from pilot draws that are thrown away: they
+depend on the image and the ancestor only, and the evidence stays unbiased. Where particles meet a peak that the pilots
+did not, a step is shortened by the particles' own weights: consistent, with a bias that falls as one over their number
+(Beskos et al. 2016), where an unbiased estimate would rest on a single particle.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+from bayes3d_ros.objects.placement import Contact, Table, shifted
+from bayes3d_ros.parsing.proposal import Modes, Proposal, propose
+from bayes3d_ros.sampling.resampling import effective_fraction
+
+Tree = TypeVar("Tree", bound=Any)
+LEVELS = 6  # of the plan
+MOST_LEVELS = 16
+TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
+_EVEN = 0.33  # share of the effective draws that a step of the exponent keeps
+_STEPS = (0.05, 1.0)  # of a component's scale, a random walk's: the likelihood's peaks are of all widths
+_LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
+
+
+def exponents(log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"]) -> Float[Array, "L"]:
+    """Increasing exponents up to 1 (repeated at the end). Each step keeps a third of the effective draws:
+    draws with these weights from q, log_ratio = log target - log q."""
+    log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
+
+    def following(b: Array, _) -> tuple[Array, Array]:
+        c = longest_step(b, jnp.ones_like(b), log_ratio, jax.nn.log_softmax(log_weight + b * log_ratio))
+        return c, c
+
+    return jax.lax.scan(following, jnp.float32(0.0), None, length=LEVELS)[1].at[-1].set(1.0)
+
+
+def longest_step(
+    b: Float[Array, ""], most: Float[Array, ""], log_ratio: Float[Array, "N"], log_weight: Float[Array, "N"]
+) -> Float[Array, ""]:
+    """The largest exponent up to `most` that keeps a third of the draws effective that are so now."""
+
+    def enough(c: Array) -> Array:
+        step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
+        return effective_fraction(log_weight + step) >= _EVEN * effective_fraction(log_weight)
+
+    def halve(bounds, _):
+        low, high = bounds
+        middle = b + jnp.sqrt((low - b) * (high - b))  # steps span orders of magnitude
+        good = enough(middle)
+        return (jnp.where(good, middle, low), jnp.where(good, high, middle)), None
+
+    (c, _), _ = jax.lax.scan(halve, (b + 1e-4 * (most - b), most), None, length=12)
+    return jnp.where(enough(most), most, c)
+
+
+def walk(key: PRNGKeyArray, contact: Contact, modes: Modes) -> Contact:
+    """A symmetric random walk in (x, y, yaw), as wide as one of the components of the same type and face, whichever."""
+    choice, noise, size = jax.random.split(key, 3)
+    count = contact.type.shape[0]
+    same = (contact.type[:, None] == modes.centre.type) & (contact.face[:, None] == modes.centre.face)
+    m = jax.random.categorical(choice, jnp.where(same, modes.log_weight, -jnp.inf))
+    scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(_LOOSE)))
+    low, high = jnp.log(jnp.array(_STEPS))
+    length = jnp.exp(low + (high - low) * jax.random.uniform(size, (count, 1)))
+    step = length * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
+    yaw = jnp.mod(contact.yaw + step[:, 2], 2 * jnp.pi)
+    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=yaw)
+
+
+def jump(key: PRNGKeyArray, contact: Contact, library: LibraryArrays) -> Contact:
+    """To one of the poses in which the object looks alike, whichever. Each has a way back: this is symmetric."""
+    ways = library.alike_face.shape[2]
+    way = jax.random.randint(key, contact.type.shape, 0, ways)
+    kind, face = jnp.maximum(contact.type, 0), jnp.maximum(contact.face, 0)
+    there = shifted(contact, library.alike_face[kind, face, way], library.alike_shift[kind, face, way])
+    return there._replace(yaw=jnp.mod(there.yaw, 2 * jnp.pi))
+
+
+class Extended(NamedTuple):
+    """N scenes, each an ancestor with one more object."""
+
+    ancestor: Int[Array, "N"]
+    new: Contact  # [N]
+    table: Float[Array, "N S P"]
+    log_likelihood: Float[Array, "N"]
+    log_q: Float[Array, "N"]  # of the new object
+    log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
+    line: Int[Array, "N"]  # which draw from q the new object descends from, by copies and small moves
+
+
+def move_new(
+    key: PRNGKeyArray,
+    at: Tree,
+    b: Float[Array, ""],
+    kind: Int[Array, ""],
+    extend: Callable[[Int[Array, "N"], Contact], Tree],
+    proposal: Proposal,
+    library: LibraryArrays,
+    table: Table,
+) -> Tree:
+    """Metropolis-Hastings of the new object under q^(1-b) target^b; at holds what `Extended` does. `kind`: 0 a jump to
+    where it looks alike, 1 a walk, 2 a fresh draw from q."""
+    draw_key, accept_key = jax.random.split(key)
+    new = jax.lax.switch(
+        kind,
+        (
+            lambda: jump(draw_key, at.new, library),
+            lambda: walk(draw_key, at.new, proposal.modes),
+            lambda: propose(draw_key, proposal, at.ancestor.shape[0], library, table),
+        ),
+    )
+    to = extend(at.ancestor, new)
+    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
+    accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
+    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)

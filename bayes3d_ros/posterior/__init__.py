@@ -1,0 +1,1 @@
+"""What a posterior over scenes is, and how samples are summarised."""

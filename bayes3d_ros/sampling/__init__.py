@@ -1,0 +1,1 @@
+"""Sequential Monte Carlo in general: nothing here knows what an object is."""

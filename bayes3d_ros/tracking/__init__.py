@@ -1,0 +1,1 @@
+"""Where a moving camera is in a known world. `session.py` is the way in."""

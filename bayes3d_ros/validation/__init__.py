@@ -1,0 +1,1 @@
+"""How right and how fast the package is. Only the commands that need it import it."""

@@ -1,0 +1,1 @@
+"""Speed, and what it is compared with."""

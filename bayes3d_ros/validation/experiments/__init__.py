@@ -1,0 +1,50 @@
+"""Experiments: one module a result, one row of EXPERIMENTS each. `bayes3d evaluate NAME` runs them."""
+
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
+
+# Name on the command line -> module; imported when it is run, because it imports jax.
+EXPERIMENTS: dict[str, str] = {
+    "calibration": "bayes3d_ros.validation.experiments.calibration",
+    "calibration-points": "bayes3d_ros.validation.experiments.calibration_points",
+    "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",
+    "coverage": "bayes3d_ros.validation.experiments.coverage",
+    "dial": "bayes3d_ros.validation.experiments.dial",
+    "exactness": "bayes3d_ros.validation.experiments.exactness",
+    "learning": "bayes3d_ros.validation.experiments.learning",
+    "parsing": "bayes3d_ros.validation.experiments.parsing",
+    "repeatability": "bayes3d_ros.validation.experiments.repeatability",
+}
+
+
+class Experiment(Protocol):
+    """What the module of an experiment offers. `quick` is a run of a minute or so that does every kind of step once."""
+
+    HEADER: str  # above the lines of rows
+
+    def notes(self, quick: bool) -> list[str]:
+        """What a user should know before it starts, such as what is left out and why; one line each."""
+
+    def count(self, quick: bool) -> int:
+        """How many steps `steps` takes."""
+
+    def steps(self, quick: bool) -> Iterator[list[Row]]:
+        """The rows of one step after the other; a step's rows reach the disk together."""
+
+    def line(self, row: Row) -> str:
+        """A row for people, under HEADER."""
+
+    def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """What all rows say: numbers, or groups of numbers, by name; None where there is nothing to say."""
+
+    def plot(self, rows: Sequence[Row], folder: Path) -> list[Path]:
+        """Write pictures into the folder; returns their paths."""
+
+
+def load(name: str) -> Experiment:
+    """The module of an experiment. Raises KeyError for a name that EXPERIMENTS lacks."""
+    return cast(Experiment, import_module(EXPERIMENTS[name]))

@@ -1,0 +1,28 @@
+"""The calibration experiment with the paper's likelihood: as many free points as pixels, handed over as they are.
+
+sigma_max is so small that windows of 3 x 3 pixels hold the sums: 3 sigma f / z stays within 1.2 pixels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.calibration import HEADER, line, notes, plot, scene_row, summary
+from bayes3d_ros.validation.reference.calibration_problem import SETTINGS, small_problem
+
+__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+
+SCENES, QUICK_SCENES = 400, 40
+POINTS = replace(SETTINGS, likelihood="points", sigma_max=0.002)
+
+
+def count(quick: bool) -> int:
+    """How many scenes there are."""
+    return QUICK_SCENES if quick else SCENES
+
+
+def steps(quick: bool) -> Iterator[list[Row]]:
+    """A row a scene. Scene k is the same whatever their number."""
+    problem = small_problem(POINTS)
+    for k in range(count(quick)):
+        yield [scene_row(k, problem)]

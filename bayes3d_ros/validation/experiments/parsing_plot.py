@@ -1,0 +1,118 @@
+"""The picture of the parsing experiment: error against visibility, true against stated error, every recording."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.validation.experiments import Row
+
+LIMIT_MM = 10.0  # ADD-S that is asked for where at least half of an object is visible
+COLUMNS = (
+    *((0.0, "recording"), (0.35, "types"), (0.45, "frames"), (0.57, "found")),
+    *((0.72, "false"), (0.82, "p(n)"), (0.94, "s")),
+)
+GREY, FAILED = "#666666", "#B22222"
+
+
+def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write parsing.png."""
+    figure = Figure(figsize=(15, 5.2), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    accuracy, honesty, table = figure.subplots(1, 3, width_ratios=(1.1, 1, 1.35))
+    objects = [row for row in rows if row["what"] == "object" and row["library"] == 10]
+    types = sorted({row["type"] for row in objects})
+    _accuracy(accuracy, objects, types)
+    _honesty(honesty, [row for row in objects if row["position_error"] is not None], types)
+    _recordings(table, rows)
+    path = folder / "parsing.png"
+    figure.savefig(path, dpi=110)
+    return [path]
+
+
+def _accuracy(axis: Axes, objects: list[Row], types: list[str]) -> None:
+    told = [row for row in objects if row["visible_fraction"] is not None]
+    found = [row for row in told if row["add_s"] is not None]
+    missed = [row for row in told if not row["found"]]
+    top = max([1.15 * LIMIT_MM, *(1.15e3 * row["add_s"] for row in found)])
+    axis.axhspan(LIMIT_MM, top * 1.1, 0.5 / 1.05, 1, color=FAILED, alpha=0.07, linewidth=0)
+    axis.axhline(LIMIT_MM, color=FAILED, linewidth=1)
+    axis.text(0.02, LIMIT_MM, "1 cm", color=FAILED, fontsize=9, va="bottom")
+    for k, name in enumerate(types):
+        aside = 0.012 * (k - (len(types) - 1) / 2)  # most objects are wholly visible: types side by side
+        for real in (False, True):
+            own = [row for row in found if row["type"] == name and row["real"] == real]
+            x, y = [row["visible_fraction"] + aside for row in own], [1e3 * row["add_s"] for row in own]
+            if own:
+                axis.scatter(x, y, label=name + " (real)" * real, clip_on=False, **_dots(k, real))
+    if missed:
+        x, y = [row["visible_fraction"] for row in missed], [top] * len(missed)
+        axis.scatter(x, y, color=FAILED, marker="x", s=50, label="not found")
+    axis.set(xlim=(0, 1.05), ylim=(0, top * 1.1))
+    _dress(axis, "visible fraction (types side by side)", "ADD-S, mm", "How far off, by how much is visible")
+    if found or missed:
+        axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.8))
+
+
+def _honesty(axis: Axes, found: list[Row], types: list[str]) -> None:
+    """Points above the line are farther off than the posterior says."""
+    sigma = np.array([1e3 * row["sigma"] for row in found])
+    error = np.array([1e3 * row["position_error"] for row in found])
+    every = np.clip(np.concatenate([sigma, error, [0.3, 10.0]]), 1e-3, None)
+    ends = np.array([every.min() / 1.5, every.max() * 1.5])
+    axis.fill_between(ends, ends, ends[1], color=FAILED, alpha=0.05, linewidth=0)
+    axis.plot(ends, ends, color=GREY, linewidth=1)
+    words: dict[str, Any] = {"color": GREY, "fontsize": 8, "rotation": 45, "ha": "right", "va": "top"}
+    axis.text(0.8 * ends[1], 0.6 * ends[1], "as far as stated", **words)
+    for k, name in enumerate(types):
+        for real in (False, True):
+            own = [i for i, row in enumerate(found) if row["type"] == name and row["real"] == real]
+            axis.scatter(np.clip(sigma[own], 1e-3, None), np.clip(error[own], 1e-3, None), **_dots(k, real))
+    axis.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal")
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_major_formatter(lambda value, _: f"{value:g}")
+    covered = f"{sum(row['covered'] for row in found)} of {len(found)} within the 95 % region"
+    _dress(axis, "stated sigma of the position, mm", "true error of the position, mm", f"How sure: {covered}")
+
+
+def _dots(k: int, real: bool) -> dict[str, Any]:
+    look = {"marker": "*", "s": 110} if real else {"marker": "o", "s": 26}
+    return {"color": colour(k + 1), "edgecolors": INK, "linewidths": 0.4, **look}
+
+
+def _recordings(axis: Axes, rows: Sequence[Row]) -> None:
+    """A line a recording and library."""
+    axis.axis("off")
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    axis.set_title("Every recording; p(true number) and seconds of its worst frame", fontsize=10, color=INK, loc="left")
+    for x, text in COLUMNS:
+        axis.text(x, 0.95, text, fontsize=9, color=GREY, va="top")
+    frames = [row for row in rows if row["what"] == "frame"]
+    groups = list(dict.fromkeys((row["bag"], row["library"]) for row in frames))
+    step = min(0.085, 0.85 / (len(groups) + 1))
+    for k, (bag, library) in enumerate(groups):
+        own = [row for row in frames if (row["bag"], row["library"]) == (bag, library)]
+        found, true = sum(row["found"] for row in own), sum(row["objects"] for row in own)
+        false = sum(row["false"] for row in own)
+        seconds = [row["seconds"] for row in own if row["seconds"] is not None]
+        words = (
+            bag, str(library), str(len(own)), f"{found} of {true}", str(false),
+            f"{min(row['probability_of_count'] for row in own):.2f}", f"{max(seconds):.1f}" if seconds else "-",
+        )  # fmt: skip
+        wrong = (False, False, False, found < true, false > 0, False, False)
+        for (x, _), text, bad in zip(COLUMNS, words, wrong, strict=True):
+            axis.text(x, 0.95 - step * (k + 1), text, fontsize=9.5, color=FAILED if bad else INK, va="top")
+
+
+def _dress(axis: Axes, x: str, y: str, title: str) -> None:
+    axis.set_xlabel(x, fontsize=9, color=INK)
+    axis.set_ylabel(y, fontsize=9, color=INK)
+    axis.set_title(title, fontsize=10, color=INK)
+    axis.tick_params(labelsize=8, colors=INK)
+    axis.grid(color="#e6e6e6", linewidth=0.7)
+    axis.set_axisbelow(True)

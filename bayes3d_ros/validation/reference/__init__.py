@@ -1,0 +1,1 @@
+"""Problems small enough for exact answers, and the exact answers."""

@@ -1,0 +1,249 @@
+"""Posteriors of small problems by exhaustive enumeration: slow, simple, and free of the sampler's code.
+
+The space of one object (type, face, x, y, yaw) is tiled with cells. Each has the value of prior times likelihood at its
+middle, noise integrated out; cells that matter are halved along x, y and yaw, until the evidence no longer moves. Of
+the model only the renderer, `log_prior`, `log_likelihood_gain`, `log_likelihood_scene` and `noise.log_marginal` are
+used.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+from scipy.special import logsumexp
+
+from bayes3d_ros.likelihood.march import march
+from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.objects.library_arrays import NUM_FACES
+from bayes3d_ros.objects.placement import Contact, T_camera_object, log_prior
+from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.validation.reference.small_problems import Problem
+
+YAW_BINS = 36  # that yaws are compared in
+FINE_YAW_BINS, XY_BINS = 180, 220  # that marginals are kept in: 2 degrees; 1 mm on a table of 22 cm
+CELL = 0.015  # metres, at most, of the first cells
+# Level by level: how many nats below the best a cell may be to be halved, and the share of the mass that the lightest
+# cells may hold together to be left whole. Middles of cells wider than a mode understate its flanks.
+LEVELS = ((200.0, 0.0), (60.0, 0.0), (30.0, 1e-6), (30.0, 1e-4), (30.0, 1e-3), (30.0, 1e-3))
+Levels = tuple[tuple[float, float], ...]
+# Nats that the last halving, and the one before it, may move the evidence by for it to stand still. Two, because moves
+# change sign: one can be small by chance.
+_STILL, _NEARLY = 0.01, 0.03
+BATCH = 128  # objects; one shape, so that there is one compilation
+
+
+Where = Callable[[Contact], np.ndarray]  # contacts [N] -> bool [N]
+
+
+_march = jax.jit(march)
+
+
+class Cells(NamedTuple):
+    """A tiling of the space of one object."""
+
+    contact: Contact  # [N], the cells' middles
+    width: Float[np.ndarray, "N 3"]  # metres, metres, radians
+    log_value: Float[np.ndarray, "N"]  # log of prior times likelihood, relative to the scene without the object
+
+    @property
+    def log_mass(self) -> Float[np.ndarray, "N"]:
+        return self.log_value + np.log(self.width).sum(1)
+
+
+class Scene(NamedTuple):
+    """What an object is added to."""
+
+    depth: Float[Array, "1 Hp Wp"]  # padded
+    table: Float[Array, "1 S P"]  # log likelihood on the coarse grid of noise, up to one constant
+    log_likelihood: Float[Array, "1"]  # noise integrated out, up to the same constant
+
+
+class Reference(NamedTuple):
+    """The posterior given exactly one object."""
+
+    cells: Cells
+    log_evidence: tuple[float, ...]  # relative to the scene without the object; of every level, the last is the finest
+
+    def marginals(self, problem: Problem) -> "Marginals":
+        weight = np.exp(self.cells.log_mass - self.cells.log_mass.max())
+        return marginals(problem, self.cells.contact, weight, self.cells.width)
+
+
+def empty_table(problem: Problem) -> Scene:
+    return _scene(problem, problem.context.image.table)
+
+
+def with_object(problem: Problem, contact: Contact) -> Scene:
+    """The table with one object, drawn and scored as a whole; contact [1]."""
+    image, library, table = problem.context
+    one = jax.tree.map(lambda a: a[0], single(contact))
+    rays = jnp.meshgrid(image.ray_x, image.ray_y)
+    depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
+    return _scene(problem, jnp.minimum(image.table, depth))
+
+
+def _scene(problem: Problem, depth: Float[Array, "H W"]) -> Scene:
+    padded = pad_scene(depth, problem.window)[None]
+    table = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
+    table = table - table.max()
+    return Scene(padded, table, log_marginal(table, problem.grid))
+
+
+def yaw_cells(count: int) -> tuple[Float[np.ndarray, "count"], float]:
+    """Middles and width of cells that tile the circle once."""
+    width = 2 * np.pi / count
+    return (np.arange(count) + 0.5) * width, width
+
+
+def all_cells(
+    problem: Problem, cell: float = CELL, yaws: int = YAW_BINS // 2
+) -> tuple[Contact, Float[np.ndarray, "N 3"]]:
+    """Cells that tile the prior's support: for every type and face their own, up to the rim of its rectangle."""
+    library = problem.context.library
+    yaw, yaw_width = yaw_cells(yaws)
+    rows, widths = [], []
+    for kind in range(int(library.num_types)):
+        for face in range(NUM_FACES):
+            free = np.asarray(problem.context.table.size) - np.asarray(library.face_size[kind, face])
+            number = np.ceil(free / cell).astype(int)
+            x, y = (((np.arange(n) + 0.5) / n - 0.5) * f for n, f in zip(number, free, strict=True))
+            grid = np.stack(np.meshgrid([kind], [face], x, y, yaw, indexing="ij"), -1).reshape(-1, 5)
+            rows.append(grid)
+            widths.append(np.tile([*(free / number), yaw_width], (len(grid), 1)))
+    return _contact(np.concatenate(rows)), np.concatenate(widths)
+
+
+def _contact(rows: Float[np.ndarray, "N 5"]) -> Contact:
+    return Contact(*rows[:, :2].T.astype(np.int32), *rows[:, 2:].T)
+
+
+def take(contact: Contact, index: np.ndarray | slice | list[int]) -> Contact:
+    return jax.tree.map(lambda a: np.asarray(a)[index], contact)
+
+
+def single(contact: Contact) -> Contact:
+    """As the model takes it: float32 on the device."""
+    kinds, places = (jnp.asarray(a, jnp.int32) for a in contact[:2]), (jnp.asarray(a, jnp.float32) for a in contact[2:])
+    return Contact(*kinds, *places)
+
+
+@partial(jax.jit, static_argnames="window")
+def _gains(contact: Contact, scene: Scene, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N S P"]:
+    nobody = jnp.zeros(contact.type.shape, jnp.int32)
+    return log_likelihood_gain(contact, nobody, scene.depth, *context, grid.coarse, window)
+
+
+@partial(jax.jit, static_argnames="window")
+def _values(contact: Contact, scene: Scene, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N"]:
+    gain = _gains(contact, scene, context, grid, window)
+    value = log_marginal(scene.table + gain, grid) - scene.log_likelihood
+    return value + log_prior(contact, context.library, context.table)
+
+
+def _batched(function, problem: Problem, scene: Scene, contact: Contact) -> np.ndarray:
+    """In batches of one shape, a thread a core: a batch keeps one busy. float64."""
+    count = len(contact.type)
+
+    def batch(start: int) -> np.ndarray:
+        some = take(contact, np.arange(start, start + BATCH) % count)
+        values = function(single(some), scene, problem.context, problem.grid, problem.window)
+        return np.asarray(values, np.float64)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return np.concatenate(list(pool.map(batch, range(0, count, BATCH))))[:count]
+
+
+def all_gains(problem: Problem, scene: Scene, contact: Contact) -> Float[np.ndarray, "N S P"]:
+    """Log likelihood that objects add to a scene, at every noise level of the coarse grid."""
+    return _batched(_gains, problem, scene, contact)
+
+
+def enumerate_object(
+    problem: Problem,
+    scene: Scene | None = None,
+    levels: Levels = LEVELS,
+    where: Where | None = None,
+    cell: float = CELL,
+) -> Reference:
+    """The posterior of one object added to a scene (by default the empty table). The best cells are halved len(levels)
+    times, fewer once the evidence stands still. `where` leaves out cells of the first level."""
+    scene = empty_table(problem) if scene is None else scene
+    contact, width = all_cells(problem, cell)
+    if where is not None:
+        inside = where(contact)
+        contact, width = take(contact, inside), width[inside]
+    cells = Cells(contact, width, _batched(_values, problem, scene, contact))
+    log_evidence = [float(logsumexp(cells.log_mass))]
+    for within, share in levels:
+        cells = halve(cells, heavy(cells, within, share), problem, scene)
+        log_evidence.append(float(logsumexp(cells.log_mass)))
+        moves = np.abs(np.diff(log_evidence[-3:]))
+        if len(log_evidence) > 3 and moves[1] < _STILL and moves[0] < _NEARLY:
+            break
+    return Reference(cells, tuple(log_evidence))
+
+
+def halve(cells: Cells, which: np.ndarray, problem: Problem, scene: Scene) -> Cells:
+    """Cut some cells in two along x, y and yaw: eight of each."""
+    eighth = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    some = take(cells.contact, which)
+    offset = (cells.width[which][:, None] * eighth).reshape(-1, 3).T
+    small = jax.tree.map(lambda a: np.repeat(a, 8), some)
+    small = small._replace(x=small.x + offset[0], y=small.y + offset[1], yaw=small.yaw + offset[2])
+    value = _batched(_values, problem, scene, small)
+    eighths = Cells(small, np.repeat(cells.width[which], 8, 0) / 2, value)
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), chosen(cells, ~which), eighths)
+
+
+class Marginals(NamedTuple):
+    """Distributions of one object, each sums to one."""
+
+    type: Float[np.ndarray, "K"]
+    face: Float[np.ndarray, "6"]
+    yaw: Float[np.ndarray, "Y"]  # FINE_YAW_BINS over the circle
+    x: Float[np.ndarray, "X"]  # XY_BINS over the table
+    y: Float[np.ndarray, "X"]
+
+
+def marginals(
+    problem: Problem, contact: Contact, weight: Float[np.ndarray, "N"], width: Float[np.ndarray, "N 3"] | None = None
+) -> Marginals:
+    """Of weighted objects: samples or, with their width, enumerated cells, whose mass is spread over them."""
+    weight = np.asarray(weight, np.float64) / np.sum(weight, dtype=np.float64)
+    parts = np.zeros(1) if width is None else np.array([-0.375, -0.125, 0.125, 0.375])
+
+    def histogram(place: ArrayLike, axis: int, period: float, bins: int) -> Float[np.ndarray, "bins"]:
+        """Of places in [0, period)."""
+        spread = 0.0 if width is None else width[:, axis, None] * parts
+        index = np.floor((np.asarray(place, np.float64)[:, None] + spread) / period * bins).astype(int) % bins
+        return np.bincount(index.ravel(), np.repeat(weight / len(parts), len(parts)), bins)
+
+    x, y = (np.asarray(a) + size / 2 for a, size in zip((contact.x, contact.y), problem.table_size, strict=True))
+    return Marginals(
+        np.bincount(np.asarray(contact.type), weight, len(problem.library.models)),
+        np.bincount(np.asarray(contact.face), weight, NUM_FACES),
+        histogram(contact.yaw, 2, 2 * np.pi, FINE_YAW_BINS),
+        histogram(x, 0, problem.table_size[0], XY_BINS),
+        histogram(y, 1, problem.table_size[1], XY_BINS),
+    )
+
+
+def heavy(cells: Cells, within: float, share: float = 0.0) -> np.ndarray:
+    """Which cells are within so many nats of the best and belong to the best that hold all but a share of the mass."""
+    mass = np.exp(cells.log_mass - cells.log_mass.max())
+    order = np.argsort(mass)
+    small = np.empty(len(mass), bool)
+    small[order] = np.cumsum(mass[order]) < share * mass.sum()
+    return (mass > np.exp(-within)) & ~small
+
+
+def chosen(cells: Cells, which: np.ndarray) -> Cells:
+    return Cells(take(cells.contact, which), cells.width[which], cells.log_value[which])

@@ -1,0 +1,157 @@
+"""Scenes small enough to be enumerated: a low-resolution noisy image of one or two simple solids on a small table."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.march import march
+from bayes3d_ros.likelihood.noise import NoiseGrid, for_image, noise_grid
+from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.objects.library_arrays import library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.parsing.search import Context
+
+CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
+NEAR, FAR = 0.1, 2.0  # metres
+DISTANCE, ELEVATION = 0.45, np.radians(38.0)  # of the camera from the table's origin, above its plane
+TABLE_SIZE = (0.22, 0.22)
+SIGMA_MAX = 0.03
+P_OUTLIER = 0.2
+WINDOW, MAX_OBJECTS = 3, 2
+VOXEL = 0.005
+
+_march = jax.jit(march)
+
+
+class Problem(NamedTuple):
+    """An image with its library and table, and what the sampler is told beside them."""
+
+    name: str
+    library: Library
+    context: Context
+    grid: NoiseGrid
+    truth: Contact  # [k]
+    table_size: tuple[float, float] = TABLE_SIZE
+    window: int = WINDOW
+    max_objects: int = MAX_OBJECTS
+
+
+def brick(x: float, y: float, z: float) -> trimesh.Trimesh:
+    return trimesh.creation.box((x, y, z))
+
+
+def step_block() -> trimesh.Trimesh:
+    """An upright L: of its six contact faces the image tells five apart."""
+    base = brick(0.08, 0.04, 0.025)
+    tower = brick(0.03, 0.04, 0.045).apply_translation((-0.025, 0, 0.035))
+    return _joined(base, tower)
+
+
+def _joined(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(list(parts))
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
+def cup(handle: bool) -> trimesh.Trimesh:
+    """A cup of 7 cm, open at the top, perhaps with a handle along +x."""
+    outline = np.array([(0, 0), (0.032, 0), (0.032, 0.07), (0.026, 0.07), (0.026, 0.006), (0, 0.006)])
+    body = trimesh.creation.revolve(outline, sections=48)
+    if not handle:
+        return body
+    return _joined(body, brick(0.03, 0.012, 0.035).apply_translation((0.043, 0, 0.03)))
+
+
+def camera_pose() -> Float[np.ndarray, "4 4"]:
+    """T_camera_table of a camera that looks along +y of the table, down at its origin."""
+    c, s = np.cos(ELEVATION), np.sin(ELEVATION)
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, -s, -c], [0, c, -s]]
+    pose[2, 3] = DISTANCE
+    return pose
+
+
+def make(
+    name: str,
+    meshes: dict[str, trimesh.Trimesh],
+    rows: list[tuple[int, float, float, float]],
+    sigma: float,
+) -> Problem:
+    """An image of upright objects, rows (type, x, y, yaw): `yaw` turns their mesh. Noise is normal along the rays, its
+    outliers are uniform in the frustum's volume."""
+    library = Library(tuple(model_from_mesh(mesh, key, VOXEL) for key, mesh in meshes.items()))
+    arrays = library_arrays(library)
+    table = Table(jnp.asarray(camera_pose(), jnp.float32), jnp.array(TABLE_SIZE))
+    truth = upright(library, arrays.T_contact_object, rows)
+    bare = _bare_table(CAMERA)
+    depth = bare.copy()
+    rays = CAMERA.rays()
+    for k in range(len(rows)):
+        one = jax.tree.map(lambda a, k=k: a[k], truth)
+        pose = T_camera_object(one, arrays, table)
+        depth = np.minimum(depth, np.asarray(_march(arrays, one.type, pose, (rays[..., 0], rays[..., 1]))))
+    rng = np.random.default_rng(0)
+    noisy = depth + sigma / np.linalg.norm(rays, axis=-1) * rng.normal(size=depth.shape)
+    wild = np.cbrt(NEAR**3 + rng.random(depth.shape) * (FAR**3 - NEAR**3))
+    observed = np.where(rng.random(depth.shape) < P_OUTLIER, wild, noisy)
+    image = Image(
+        depth=jnp.asarray(observed, jnp.float32),
+        kind=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
+        ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
+        ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
+        focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
+        centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
+        table=jnp.asarray(bare, jnp.float32),
+        outlier_scale=jnp.float32(3 / (FAR**3 - NEAR**3)),
+        front_margin=jnp.float32(3 * SIGMA_MAX),
+    )
+    context = Context(image, arrays, table)
+    return Problem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, WINDOW), truth)
+
+
+def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Contact:
+    """Contacts that stand meshes on their lower side, turned by yaw about z, with their box's centre above (x, y)."""
+    face = [int(np.argmin(library.models[row[0]].contact_normal[:, 2])) for row in rows]
+    kind, x, y, yaw = (np.array(column) for column in zip(*rows, strict=True))
+    turn = np.asarray(T_contact_object)[kind, face, :2, 0]  # the mesh's x axis at yaw 0
+    yaw = np.mod(yaw - np.arctan2(turn[:, 1], turn[:, 0]), 2 * np.pi)
+    whole = (jnp.asarray(a, jnp.int32) for a in (kind, np.array(face)))
+    return Contact(*whole, *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
+
+
+def _bare_table(camera: Intrinsics) -> Float[np.ndarray, "H W"]:
+    T, rays = camera_pose(), camera.rays()
+    facing = rays @ T[:3, 2]
+    with np.errstate(divide="ignore"):
+        depth = T[:3, 2] @ T[:3, 3] / facing
+    return np.where((facing < -0.01) & (depth < FAR), depth, np.inf)
+
+
+# Handles point away from the camera at a quarter turn.
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    "block": lambda: make("block", {"block": step_block()}, [(0, 0.01, -0.02, 0.4)], 0.012),
+    "handle seen": lambda: make("handle seen", {"mug": cup(True)}, [(0, 0.01, -0.01, -0.4)], 0.012),
+    "handle hidden": lambda: make("handle hidden", {"mug": cup(True)}, [(0, 0.01, -0.01, np.pi / 2)], 0.010),
+    "brick": lambda: make("brick", {"brick": brick(0.07, 0.05, 0.035)}, [(0, -0.01, 0.01, 0.5)], 0.012),
+    "mug or cup": lambda: make(
+        "mug or cup", {"cup": cup(False), "mug": cup(True)}, [(1, 0.01, -0.01, np.pi / 2)], 0.010
+    ),
+    "two bricks": lambda: make(
+        "two bricks",
+        {"long": brick(0.07, 0.05, 0.035), "short": brick(0.062, 0.05, 0.035)},
+        [(0, -0.01, 0.01, 0.5)],
+        0.012,
+    ),
+    "two blocks": lambda: make(
+        "two blocks", {"block": step_block()}, [(0, -0.055, -0.03, 0.4), (0, 0.055, 0.03, -0.9)], 0.012
+    ),
+}

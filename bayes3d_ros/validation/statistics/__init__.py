@@ -1,0 +1,1 @@
+"""What is computed from samples and truths: ranks, regions, errors, agreement."""

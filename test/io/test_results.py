@@ -1,0 +1,142 @@
+"""What the result files hold is what the posteriors say, and an interrupted run leaves whole lines."""
+
+import errno
+import json
+
+import numpy as np
+import pytest
+
+from bayes3d_ros.io.results import ResultsError, ResultsWriter, scene_record
+from bayes3d_ros.posterior.summarise import posterior_rows
+
+TYPES = ("bowl", "can", "mug")
+KEYS = [
+    "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects",
+    "T_camera_table", "ess", "usable_share", "notes",
+]  # fmt: skip
+OBJECT_KEYS = [
+    "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
+    "face_probabilities", "modes",
+]  # fmt: skip
+
+
+@pytest.fixture
+def written(tmp_path, depth_frame, fake_posterior):
+    """A folder with three frames, of 2, 0 and 3 objects, and what was written."""
+    pairs = []
+    with ResultsWriter(tmp_path / "out", TYPES) as results:
+        for stamp, objects in ((10**18 + 5, 2), (10**18 + 6, 0), (10**18 + 7, 3)):
+            frame = depth_frame(stamp)
+            posterior = fake_posterior(frame, TYPES, objects)
+            picture = results.write(frame.depth, posterior)
+            assert picture == tmp_path / "out" / "frames" / f"{stamp}.png"
+            pairs.append((frame, posterior))
+    return tmp_path / "out", pairs
+
+
+def test_a_line_a_frame(written):
+    folder, pairs = written
+    lines = [json.loads(text) for text in (folder / "scenes.jsonl").read_text().splitlines()]
+    assert len(lines) == 3
+    for line, (_, posterior) in zip(lines, pairs, strict=True):
+        assert list(line) == KEYS
+        assert line["stamp_ns"] == posterior.stamp_ns and line["size"] == [64, 48]
+        assert sum(line["num_objects"].values()) == pytest.approx(1.0)
+        assert len(line["objects"]) == len(posterior.objects)
+        for entry, found in zip(line["objects"], posterior.objects, strict=True):
+            assert list(entry) == OBJECT_KEYS
+            np.testing.assert_allclose(entry["covariance"], found.covariance, rtol=1e-9)
+            np.testing.assert_allclose(entry["position"], found.position, rtol=1e-9)
+            assert sum(entry["face_probabilities"]) == pytest.approx(1.0)
+            for mode, other in zip(entry["modes"], found.modes, strict=True):
+                assert list(mode) == ["weight", "position", "orientation", "covariance", "contact_face"]
+                assert mode["weight"] == pytest.approx(other.weight)
+                np.testing.assert_allclose(mode["covariance"], other.covariance, rtol=1e-9)
+
+
+def test_samples_are_the_posterior_rows_of_all_frames(written):
+    folder, pairs = written
+    samples = np.load(folder / "samples.npz", allow_pickle=False)
+    assert samples["types"].tolist() == list(TYPES)
+    expected = [posterior_rows(posterior.samples, posterior.object_index) for _, posterior in pairs]
+    assert samples["frame"].tolist() == [k for k, rows in enumerate(expected) for _ in rows]
+    for name in expected[0].dtype.names:
+        np.testing.assert_array_equal(samples[name], np.concatenate([rows[name] for rows in expected]))
+        assert samples[name].dtype == expected[0].dtype[name]
+
+
+def test_frames_hold_the_images(written):
+    folder, pairs = written
+    for frame, posterior in pairs:
+        arrays = np.load(folder / "frames" / f"{frame.stamp_ns}.npz")
+        np.testing.assert_array_equal(arrays["depth"], frame.depth)
+        np.testing.assert_array_equal(arrays["segmentation"], posterior.segmentation)
+        assert arrays["reconstruction"].dtype == np.float32 and arrays["segmentation"].dtype == np.uint16
+
+
+def test_frames_of_one_stamp_do_not_replace_each_other(depth_frame, fake_posterior, tmp_path):
+    with ResultsWriter(tmp_path, TYPES) as results:
+        paths = [results.write(depth_frame(s).depth, fake_posterior(depth_frame(s), TYPES)) for s in (0, 0, 5, 0)]
+    assert [path.stem for path in paths] == ["0", "0_2", "5", "0_3"]
+    assert all(path.with_suffix(".npz").is_file() for path in paths)
+    with ResultsWriter(tmp_path, TYPES):
+        pass
+    assert list((tmp_path / "frames").iterdir()) == []
+
+
+def test_the_same_posteriors_give_the_same_bytes(written, tmp_path):
+    folder, pairs = written
+    with ResultsWriter(tmp_path / "again", TYPES) as results:
+        for frame, posterior in pairs:
+            results.write(frame.depth, posterior)
+    for name in ("scenes.jsonl", "samples.npz", *(f"frames/{frame.stamp_ns}.npz" for frame, _ in pairs)):
+        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_an_interrupted_run_keeps_what_was_finished(tmp_path, depth_frame, fake_posterior):
+    frame = depth_frame()
+    posterior = fake_posterior(frame, TYPES)
+    with pytest.raises(KeyboardInterrupt), ResultsWriter(tmp_path, TYPES) as results:
+        results.write(frame.depth, posterior)
+        assert (tmp_path / "scenes.jsonl").read_text().endswith("}\n")  # already there, were the process killed now
+        raise KeyboardInterrupt
+    assert set(np.load(tmp_path / "samples.npz")["frame"]) == {0}
+    assert {path.name for path in tmp_path.iterdir()} == {"scenes.jsonl", "samples.npz", "frames"}
+
+
+def test_a_new_run_replaces_the_frames_of_an_old_one_and_nothing_else(written):
+    folder, _ = written
+    (folder / "notes.txt").write_text("mine")
+    (folder / "frames" / "mine.png").write_text("mine")
+    with ResultsWriter(folder, TYPES):
+        pass
+    assert (folder / "scenes.jsonl").read_text() == ""
+    assert len(np.load(folder / "samples.npz")["frame"]) == 0
+    assert [path.name for path in (folder / "frames").iterdir()] == ["mine.png"]
+    assert (folder / "notes.txt").exists()
+
+
+def test_numbers_that_are_not_finite_are_null(depth_frame, fake_posterior):
+    from dataclasses import replace
+
+    record = scene_record(replace(fake_posterior(depth_frame(), TYPES), log_evidence=float("-inf")))
+    assert record["log_evidence"] is None
+    json.dumps(record, allow_nan=False)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultsError, match=r"file: cannot write results here"), ResultsWriter(tmp_path / "file", TYPES):
+        pass
+
+
+def test_a_full_disk_names_the_folder(depth_frame, fake_posterior, tmp_path, monkeypatch):
+    def full(*arguments, **arrays):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    frame = depth_frame(1)
+    with ResultsWriter(tmp_path, TYPES) as results:
+        monkeypatch.setattr(np, "savez_compressed", full)
+        with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}'"):
+            results.write(frame.depth, fake_posterior(frame, TYPES))
+    assert (tmp_path / "scenes.jsonl").read_text() == ""

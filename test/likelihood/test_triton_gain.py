@@ -1,0 +1,37 @@
+"""The GPU's kernel where there is no GPU: it is lowered to Triton for one. What it computes is compared with the
+reference in test_camera_score.py and test_scene_score.py."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AbstractDevice, AbstractMesh
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
+from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+
+COUNT, SIZE = 5, 20
+NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.1, 0.4]))
+
+
+@pytest.fixture(scope="module")
+def image(returns_everywhere):
+    return returns_everywhere(Intrinsics(25.0, 25.0, 9.5, 9.5, SIZE, SIZE), np.ones((SIZE, SIZE)))
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")  # docs/speed.md
+@pytest.mark.parametrize("over_scenes", [False, True])
+def test_it_is_lowered_for_a_gpu(over_scenes, image, arrays):
+    T = jnp.tile(jnp.eye(4), (COUNT, 2, 1, 1)).at[:, :, 2, 3].set(0.5)
+    drawn = Drawn(jnp.zeros((COUNT, 2), jnp.int32), T, jnp.zeros((COUNT, 4)))
+    scenes = Scenes(jnp.ones((3, SIZE + 12, SIZE + 12)), jnp.zeros(COUNT, jnp.int32)) if over_scenes else None
+    gain = jax.jit(triton_gain, static_argnames=("window", "interpret"))
+    with jax.sharding.use_abstract_mesh(
+        AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", None, "gpu"))
+    ):
+        traced = gain.trace(drawn, scenes, image, arrays, NOISE, window=5, interpret=False)
+        lowered = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert "__gpu$xla.gpu.triton" in lowered and "triton_gain" in lowered
+    assert f"tensor<{COUNT * 2 * 4}xf32>" in lowered  # three of p_outlier are padded to four

@@ -1,0 +1,162 @@
+"""Contact poses, their prior, and the test of interpenetration."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from bayes3d_ros.objects.library_arrays import library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.placement import Contact, T_camera_object, T_table_object, Table, log_prior, overlap
+
+BOWL, BOX, SPHERE = 0, 1, 3
+
+
+def contact(kind, face, x=0.0, y=0.0, yaw=0.0):
+    """Contacts of one shape, from numbers or arrays."""
+    kind, face, x, y, yaw = np.broadcast_arrays(kind, face, x, y, yaw)
+    return Contact(jnp.asarray(kind), jnp.asarray(face), *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
+
+
+def table_of(width, depth):
+    return Table(jnp.eye(4), jnp.array([width, depth]))
+
+
+KINDS, FACES = (a.ravel() for a in np.mgrid[:5, :6])
+
+
+@pytest.fixture(scope="module")
+def poses(arrays):
+    """T_table_object of every model on every face at (0.1, -0.2), turned by 0.7."""
+    return np.asarray(T_table_object(contact(KINDS, FACES, 0.1, -0.2, 0.7), arrays))
+
+
+def test_poses_are_rigid(poses):
+    rotation = poses[:, :3, :3]
+    np.testing.assert_allclose(
+        rotation @ rotation.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (30, 3, 3)), atol=1e-5
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-5)
+    np.testing.assert_array_equal(poses[:, 3], np.broadcast_to([0, 0, 0, 1], (30, 4)))
+
+
+def test_objects_stand_on_the_table(poses, library):
+    """The lowest point of the surface is at z = 0, and the contact normal points straight down."""
+    for kind, face, T in zip(KINDS, FACES, poses, strict=True):
+        model = library.models[kind]
+        height = model.surface_points @ T[2, :3] + T[2, 3]
+        assert abs(height.min()) < 0.6 * model.voxel_size, (model.name, face)
+        np.testing.assert_allclose(T[:3, :3] @ model.contact_normal[face], [0, 0, -1], atol=1e-5)
+
+
+def test_the_box_centre_is_above_x_y(poses, library):
+    for kind, T in zip(KINDS, poses, strict=True):
+        centre = T[:3, :3] @ library.models[kind].T_object_box[:3, 3] + T[:3, 3]
+        np.testing.assert_allclose(centre[:2], [0.1, -0.2], atol=1e-5)
+        assert centre[2] > 0
+
+
+def test_faces_of_a_box(poses, library):
+    """A box on its face k shows the opposite face on top, at the box's height along that axis."""
+    model = library.models[BOX]
+    for face in range(6):
+        T = poses[(KINDS == BOX) & (face == FACES)][0]
+        axis = model.T_object_box[:3, face // 2] * (1 - 2 * (face % 2))
+        np.testing.assert_allclose(T[:3, :3] @ axis, [0, 0, -1], atol=1e-5)
+        np.testing.assert_allclose(2 * T[2, 3], model.box_size[face // 2], atol=1e-5)
+
+
+def test_yaw_turns_about_the_vertical_through_the_box_centre(poses, arrays):
+    still = np.asarray(T_table_object(contact(KINDS, FACES), arrays))
+    c, s = np.cos(0.7), np.sin(0.7)
+    slide = np.array([[c, -s, 0, 0.1], [s, c, 0, -0.2], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(poses, slide @ still, atol=1e-6)
+    around = np.asarray(T_table_object(contact(KINDS, FACES, 0.1, -0.2, 0.7 + 2 * np.pi), arrays))
+    np.testing.assert_allclose(poses, around, atol=2e-6)
+
+
+def test_face_size_is_the_extent_along_x_and_y(arrays, library):
+    """Of a box, the rectangle that it covers at yaw 0."""
+    model = library.models[BOX]
+    for face in range(6):
+        T = np.asarray(T_table_object(contact(BOX, face), arrays))
+        extent = np.abs(T[:2, :3] @ model.T_object_box[:3, :3]) @ model.box_size
+        np.testing.assert_allclose(np.asarray(arrays.face_size)[BOX, face], extent, atol=1e-5)
+
+
+def test_camera_pose_is_the_table_pose_seen_from_the_camera(arrays):
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    T[:3, 3] = [0.1, 0.2, 0.7]
+    c = contact(KINDS, FACES, 0.1, -0.2, 0.7)
+    got = T_camera_object(c, arrays, Table(jnp.asarray(T, jnp.float32), jnp.ones(2)))
+    np.testing.assert_allclose(np.asarray(got), T @ np.asarray(T_table_object(c, arrays)), atol=1e-6)
+
+
+def test_the_prior_integrates_to_one(arrays):
+    """Summed over types and faces, integrated over a grid of (x, y) and over yaw."""
+    table = table_of(0.5, 0.4)
+    step = 0.0025
+    x, y = np.arange(-0.3, 0.3, step) + step / 2, np.arange(-0.3, 0.3, step) + step / 2
+    kind, face, x, y = np.meshgrid(np.arange(8), np.arange(6), x, y, indexing="ij")
+    density = np.exp(np.asarray(log_prior(contact(kind, face, x, y, 1.0), arrays, table), np.float64))
+    np.testing.assert_allclose(density.sum() * step**2 * 2 * np.pi, 1, rtol=0.02)  # a cell at the rim counts or not
+    per_face = density.sum((2, 3)) * step**2 * 2 * np.pi
+    np.testing.assert_allclose(per_face[:5], 1 / 30, rtol=0.05)  # every type and face alike
+    assert (per_face[5:] == 0).all()  # types that only pad the arrays
+
+
+def test_the_prior_is_uniform_inside_and_nothing_outside(arrays, library):
+    table, size = table_of(0.5, 0.4), library.models[BOX].box_size
+    free = np.array([0.5, 0.4]) - size[[1, 2]]  # face 0 is normal to the box's x
+    inside = contact(BOX, 0, np.array([0, 0.49, -0.49]) * free[0], np.array([0, -0.49, 0.49]) * free[1], [0, 1.0, 6.2])
+    np.testing.assert_allclose(log_prior(inside, arrays, table), -np.log(30 * free.prod() * 2 * np.pi), rtol=1e-5)
+    outside = contact(BOX, 0, np.array([0.51, 0, -0.51]) * free[0], np.array([0, 0.51, 0.2]) * free[1])
+    assert np.isneginf(np.asarray(log_prior(outside, arrays, table))).all()
+    assert np.isneginf(np.asarray(log_prior(contact([-1, 5, 7], 0), arrays, table))).all()
+
+
+def test_disjoint_solids_do_not_overlap(arrays):
+    rng = np.random.default_rng(0)
+    n = 40
+    a = contact(rng.integers(0, 5, n), rng.integers(0, 6, n), 0, 0, rng.uniform(0, 6, n))
+    b = contact(rng.integers(0, 5, n), rng.integers(0, 6, n), 0.16, 0.16, rng.uniform(0, 6, n))
+    assert (np.asarray(overlap(a, b, arrays)) == 0).all()
+
+
+def test_a_solid_overlaps_itself_wholly_and_either_way_alike(arrays):
+    rng = np.random.default_rng(1)
+    everything = contact(KINDS, FACES, 0.1, -0.05, 2.0)
+    np.testing.assert_allclose(overlap(everything, everything, arrays), 1, atol=0.01)
+    n = 60
+    a, b = (
+        contact(rng.integers(0, 5, n), rng.integers(0, 6, n), *rng.uniform(-0.04, 0.04, (2, n)), rng.uniform(0, 6, n))
+        for _ in range(2)
+    )
+    there, back = np.asarray(overlap(a, b, arrays)), np.asarray(overlap(b, a, arrays))
+    np.testing.assert_allclose(there, back, atol=1e-6)
+    assert (there >= 0).all() and (there <= 1).all() and there.max() > 0.3
+
+
+def test_boxes_side_by_side(arrays):
+    """Boxes pushed into one another by a share of their width overlap by that share, of 128 points and whole voxels."""
+    size = np.asarray(arrays.face_size)[BOX, 4, 0]
+    for share in (0.25, 0.5, 0.75):
+        pushed = contact(BOX, 4, (1 - share) * size)
+        assert abs(float(overlap(contact(BOX, 4), pushed, arrays)) - share) < 0.12
+    gap = contact(BOX, 4, size + 2 * 0.004)
+    assert float(overlap(contact(BOX, 4), gap, arrays)) == 0
+
+
+def test_a_bowl_is_hollow(library):
+    """Turned over, it stands above a small cube without touching it; pushed aside, its wall goes through the cube."""
+    bowl, cube = library.models[BOWL], model_from_mesh(trimesh.creation.box((0.03,) * 3), "cube", 0.004)
+    pair = library_arrays(Library((bowl, cube)))
+    dome = contact(0, int(np.argmax(bowl.contact_normal[:, 2])))
+    assert float(T_table_object(dome, pair)[2, 2]) < -0.99
+    x = np.array([0.0, 0.01, 0.045, 0.12])
+    domes = contact(np.full(4, int(dome.type)), int(dome.face))
+    share = np.asarray(overlap(domes, contact(1, 4, x), pair))
+    np.testing.assert_array_equal(share[[0, 1, 3]], 0)
+    assert share[2] > 0.1

@@ -1,0 +1,68 @@
+"""Modes that a search follows, and how draws are shared among them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.parsing.mode_search import Hypotheses, factor, log_shares, sharpen
+
+
+def test_a_type_of_a_few_percent_is_drawn_however_many_modes_the_other_has():
+    mass = jnp.log(jnp.array([0.32, 0.32, 0.31, 0.05]))
+    share = np.exp(log_shares(mass, jnp.array([0, 0, 0, 1])))
+    assert np.isclose(share.sum(), 1, atol=1e-5) and share[3] > 0.2
+    split = np.exp(log_shares(jnp.log(jnp.array([0.95, 0.05])), jnp.array([0, 1])))
+    assert np.isclose(share[3], split[1], atol=1e-5)  # modes of one type are counted together
+
+
+def test_likelier_modes_get_more_and_impossible_ones_nothing():
+    share = np.exp(log_shares(jnp.array([0.0, -1.0, -300.0]), jnp.array([2, 2, 5])))
+    assert share[0] > share[1] > 0.3 and share[2] < 1e-20
+
+
+def test_a_type_of_which_no_pilot_was_drawn_leaves_the_shares_finite():
+    log_share = np.asarray(log_shares(jnp.array([3.0, -jnp.inf, -jnp.inf]), jnp.array([0, 1, 1])))
+    assert np.isfinite(log_share).all() and np.isclose(np.exp(log_share[0]), 1)
+
+
+def test_factors_of_covariances_that_rounding_made_indefinite():
+    turn, shift = 1e-3, 0.4
+    along = np.array([shift * turn, -shift * turn, turn])
+    square = np.outer(along, along)
+    covariance = jnp.asarray(np.stack([square, square - 1e-12 * np.eye(3), np.diag([1e-4, 1e-6, 0.3])]), jnp.float32)
+    scale = np.asarray(factor(covariance), np.float64)
+    assert np.isfinite(scale).all() and (np.triu(scale, 1) == 0).all()
+    np.testing.assert_allclose(scale @ scale.swapaxes(1, 2), covariance, rtol=2e-5, atol=1e-11)
+
+
+def test_sharpening_finds_a_peak_and_its_shape():
+    spread, top = np.array([4e-4, 2e-4, 6e-3]), np.array([0.1, -0.05, 0.7])
+
+    def gains(contact):
+        off = jnp.stack([contact.x, contact.y, contact.yaw], -1) - top
+        return 1e3 - 0.5 * ((off / spread) ** 2).sum(-1)
+
+    modes, value = sharpen(jax.random.key(0), _hypotheses(top + 2 * spread), gains, 24, 5)
+    assert value[0] > 1e3 - 1
+    np.testing.assert_allclose(np.array([*modes.contact[2:]])[:, 0], top, atol=2e-4)
+    np.testing.assert_allclose(np.diagonal(modes.scale[0] @ modes.scale[0].T) ** 0.5, spread, rtol=0.1)
+
+
+def test_sharpening_a_ridge_without_end_stays_finite():
+    """A likelihood that does not change along x and yaw, and one that is the same everywhere."""
+
+    def ridge(contact):
+        return -0.5 * (contact.y / 1e-4) ** 2
+
+    for gains in (ridge, lambda contact: jnp.zeros_like(contact.x)):
+        modes, value = sharpen(jax.random.key(0), _hypotheses(np.zeros(3)), gains, 24, 12)
+        spread = np.linalg.norm(np.asarray(modes.scale[0]), axis=1)
+        assert np.isfinite(modes.scale).all() and np.isfinite(value).all()
+        assert (np.diagonal(np.asarray(modes.scale[0])) > 0).all() and (spread < [0.051, 0.051, 2.1]).all()
+
+
+def _hypotheses(at):
+    zero = jnp.zeros(1, jnp.int32)
+    contact = Contact(zero, zero, *(jnp.array([v], jnp.float32) for v in at))
+    return Hypotheses(contact, jnp.diag(jnp.array([5e-4, 5e-4, 1e-2]))[None])
