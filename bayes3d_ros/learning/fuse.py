@@ -30,7 +30,7 @@ _FOOT = 0.015  # metres: what is seen so low is taken to reach down to the table
 _THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)
 
 
-class Grid(NamedTuple):
+class FusionGrid(NamedTuple):
     """Voxels of a box in the table frame; the table is half a voxel above the box's base, in the lowest layer's middle:
     a flat base on the face between two layers would be in both or in none."""
 
@@ -104,7 +104,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
 
 
-def _grid(surfaces: Sequence[Surface], voxel_size: float) -> Grid:
+def _grid(surfaces: Sequence[Surface], voxel_size: float) -> FusionGrid:
     points = np.concatenate([surface.points for surface in surfaces])
     low, high = points.min(0), points.max(0)
     low[:2], high = low[:2] - voxel_size, high + voxel_size
@@ -113,10 +113,10 @@ def _grid(surfaces: Sequence[Surface], voxel_size: float) -> Grid:
     if shape.prod() > _MOST_VOXELS:
         size = " x ".join(f"{n}" for n in shape)
         raise FusionError(f"the object would fill a grid of {size} voxels: expected larger voxels than {voxel_size} m")
-    return Grid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
+    return FusionGrid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
 
 
-def _hits(surface: Surface, grid: Grid) -> Int[np.ndarray, "V"]:
+def _hits(surface: Surface, grid: FusionGrid) -> Int[np.ndarray, "V"]:
     """1 for voxels that hold points of this view. A single one may be a stray."""
     return (np.bincount(grid.voxel_of(surface.points), minlength=int(np.prod(grid.shape))) > 1).astype(int)
 
@@ -149,7 +149,7 @@ def _pieces(voxels: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     return (sizes >= min(_FEWEST, int(sizes.max(initial=0))))[labels] & voxels
 
 
-def _noise_of_a_neighbour(patches: Patches, grid: Grid) -> Bool[np.ndarray, "S"]:
+def _noise_of_a_neighbour(patches: Patches, grid: FusionGrid) -> Bool[np.ndarray, "S"]:
     """Voxels that hold only the tail of a surface next door: points of one surface scatter over two layers."""
     voxel, normal, offset = patches.voxel, patches.normal, patches.offset
     times, near = _THIN
@@ -178,7 +178,7 @@ def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
         raise FusionError(f"the points seen have no volume ({str(error).splitlines()[0][:80]})") from None
 
 
-def _within(hull: ConvexHull, grid: Grid) -> Bool[np.ndarray, "X Y Z"]:
+def _within(hull: ConvexHull, grid: FusionGrid) -> Bool[np.ndarray, "X Y Z"]:
     """Voxels whose middles lie in the hull: between its highest and lowest plane of their column."""
     x, y, z = (grid.origin[k] + (np.arange(grid.shape[k]) + 0.5) * grid.voxel_size for k in range(3))
     low, high = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)

@@ -13,7 +13,7 @@ from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
 from bayes3d_ros.likelihood.hypotheses import Drawn
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.plane import plane_depth
-from bayes3d_ros.likelihood.scored_image import Image, observed
+from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
 from bayes3d_ros.likelihood.tiled_render import over_depth
 from bayes3d_ros.likelihood.tiles import tile_size, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
@@ -24,7 +24,7 @@ class World(NamedTuple):
 
     type: Int[Array, "K"]
     T_world_object: Float[Array, "K 4 4"]
-    table: Bool[Array, ""]  # whether the plane z = 0 is a surface
+    table_visible: Bool[Array, ""]  # whether the plane z = 0 is a surface
 
 
 def table_depth(
@@ -39,14 +39,14 @@ def table_depth(
 def log_likelihood_of_cameras(
     T_camera_world: Float[Array, "N 4 4"],
     world: World,
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     noise: Noise,
     window: int,
 ) -> Float[Array, "N S P"]:
     """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
-    `image.table` is not used."""
+    `image.bare_depth` is not used."""
     if gain := kernel(image):
         return gain(_drawn(T_camera_world, world), None, image, library, noise, window)
     half = window // 2
@@ -54,7 +54,9 @@ def log_likelihood_of_cameras(
     count, objects = len(T_camera_world), len(world.type)
     T = product(T_camera_world[:, None], world.T_world_object)
     kinds = jnp.broadcast_to(world.type, (count, objects))
-    drawn, scored = (tiles_of_objects(T, kinds, image, library, grown, world.table, size.tile) for grown in (0, half))
+    drawn, scored = (
+        tiles_of_objects(T, kinds, image, library, grown, world.table_visible, size.tile) for grown in (0, half)
+    )
 
     def draw(n, rays):
         return depth_along(T_camera_world[n], world, library, rays)
@@ -62,7 +64,7 @@ def log_likelihood_of_cameras(
     def score(total, n, u, v, depth, real):
         pixels = observed(image, u, v, (size.tile, size.tile))
         value = log_likelihood(depth, pixels, noise, window)
-        alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
+        alone = jnp.where(pixels.pixel_class == NO_RETURN, 0.0, jnp.log(outlier_density(pixels))).sum((0, 1))
         return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
@@ -76,8 +78,8 @@ def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> Drawn:
     return Drawn(
         type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
         T_camera_object=product(T_camera_world[:, None], world.T_world_object),
-        plane=jnp.where(world.table, plane, 0.0),
-        everywhere=world.table,
+        plane=jnp.where(world.table_visible, plane, 0.0),
+        everywhere=world.table_visible,
     )
 
 
@@ -89,7 +91,7 @@ def depth_along(
 ) -> Float[Array, "*shape"]:
     """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is; `n` broadcasts against `shape` from
     the right."""
-    depth = jnp.where(world.table, table_depth(T_camera_world, *rays), jnp.inf)
+    depth = jnp.where(world.table_visible, table_depth(T_camera_world, *rays), jnp.inf)
     for k in range(len(world.type)):
         T = product(T_camera_world, world.T_world_object[k])
         depth = jnp.minimum(depth, march(library, world.type[k], T, rays))
@@ -97,7 +99,7 @@ def depth_along(
 
 
 def render_cameras(
-    T_camera_world: Float[Array, "N 4 4"], world: World, image: Image, library: LibraryArrays
+    T_camera_world: Float[Array, "N 4 4"], world: World, image: ScoredImage, library: LibraryArrays
 ) -> Float[Array, "N H W"]:
     """What each camera sees in the pixels of an image."""
     if depth := depth_kernel():

@@ -65,7 +65,7 @@ class Pixels(NamedTuple):
     """Observed pixels with their geometry: rays (x, y, 1), and the ray's change per pixel."""
 
     depth: Float[Array, "h w T"]  # metres, any finite number where there is no return
-    kind: Int[Array, "h w T"]
+    pixel_class: Int[Array, "h w T"]
     ray_x: Float[Array, "h w T"]
     ray_y: Float[Array, "h w T"]
     step_x: Float[Array, ""]
@@ -188,8 +188,8 @@ def by_kind(pixels: Pixels, rendered: Float[Array, "h w T"], inlier: Array) -> t
     (1 - p_out) inlier; given `inlier` is that of returns in the workspace."""
     a = outlier_density(pixels)
     beyond = jnp.where(rendered < pixels.depth + pixels.front_margin, 0.0, a)
-    inlier = jnp.where(pixels.kind == IN_WORKSPACE, inlier, jnp.where(pixels.kind == BEYOND, beyond, 1.0))
-    return jnp.where(pixels.kind == NO_RETURN, 1.0, a), inlier
+    inlier = jnp.where(pixels.pixel_class == IN_WORKSPACE, inlier, jnp.where(pixels.pixel_class == BEYOND, beyond, 1.0))
+    return jnp.where(pixels.pixel_class == NO_RETURN, 1.0, a), inlier
 
 
 def _sum_log(

@@ -7,8 +7,8 @@ import jax
 from jaxtyping import Array, Float
 
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
@@ -17,11 +17,17 @@ class Gain(Protocol):
     without scenes, nothing is there before."""
 
     def __call__(
-        self, drawn: Drawn, scenes: Scenes | None, image: Image, library: LibraryArrays, noise: Noise, window: int
+        self,
+        drawn: Drawn,
+        scenes: SceneDepths | None,
+        image: ScoredImage,
+        library: LibraryArrays,
+        noise: Noise,
+        window: int,
     ) -> Float[Array, "N S P"]: ...
 
 
-def kernel(image: Image) -> Gain | None:
+def kernel(image: ScoredImage) -> Gain | None:
     """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
     tile (`tiled_render.py`): free points, other backends."""
     if image.likelihood.name != "depth" or image.points is not None:

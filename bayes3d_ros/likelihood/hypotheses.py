@@ -14,7 +14,7 @@ class Drawn(NamedTuple):
     everywhere: Bool[Array, ""] | bool = False  # whether the plane is there: then the whole image may change
 
 
-class Scenes(NamedTuple):
+class SceneDepths(NamedTuple):
     """What is there already: scenes with a border (`pad_scene`), and the one of each hypothesis."""
 
     depth: Float[Array, "A Hp Wp"]

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 # Coarse grid: sigma_max 2^(-k/3), logit p. Each sigma costs a pass over the window, a p next to nothing.
 _SIGMA_STEPS, _P_STEPS = 11, 17
@@ -55,7 +55,7 @@ class NoiseGrid(NamedTuple):
     to_fine_p: Float[Array, "Pf P"]
     log_mass: Float[Array, "Sf Pf"]  # prior mass of the fine points
     p_error: Float[Array, "Pf"]  # by which splines miss log(1 - p_outlier)
-    returns: Float[Array, ""]  # how many returns a table sums over, times their weight
+    returns: Float[Array, ""]  # how many returns a log likelihood sums over, times their weight
     sigma_error: Float[Array, "Sf P"]  # by which splines in sigma fall short of the log likelihood of a reference scene
     sigma_error_parts: Float[Array, "K P"]  # the same at the parts of the fine steps
 
@@ -90,15 +90,15 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
 
 @jax.jit
 def for_returns(
-    grid: NoiseGrid, kind: Int[Array, "*shape"], weight: Float[Array, ""] | np.floating | float = 1.0
+    grid: NoiseGrid, pixel_class: Int[Array, "*shape"], weight: Float[Array, ""] | np.floating | float = 1.0
 ) -> NoiseGrid:
     """The grid for tables of an image with these kinds of pixels, each of this weight. Those beyond the workspace
     hardly depend on p."""
-    return grid._replace(returns=weight * (jnp.asarray(kind) == IN_WORKSPACE).sum().astype(jnp.float32))
+    return grid._replace(returns=weight * (jnp.asarray(pixel_class) == IN_WORKSPACE).sum().astype(jnp.float32))
 
 
 @partial(jax.jit, static_argnames="window")
-def for_image(grid: NoiseGrid, image: Image, window: int) -> NoiseGrid:
+def for_image(grid: NoiseGrid, image: ScoredImage, window: int) -> NoiseGrid:
     """The grid for tables of this image: `for_returns`, and what splines in sigma miss.
 
     Every return that goes from inlier to outlier as sigma falls bends the log likelihood within a tenth of log sigma,
@@ -108,11 +108,11 @@ def for_image(grid: NoiseGrid, image: Image, window: int) -> NoiseGrid:
     """
     ends = jnp.log(grid.coarse.sigma[0]), jnp.log(grid.coarse.sigma[-1])
     dense = Noise(jnp.exp(jnp.linspace(*ends, _DENSE_STEPS)), grid.coarse.p_outlier)
-    table = log_likelihood_scene(pad_scene(image.table, window)[None], image, dense, window)[0]
-    table = table - table.max()
+    loglik_grid = log_likelihood_scene(pad_scene(image.bare_depth, window)[None], image, dense, window)[0]
+    loglik_grid = loglik_grid - loglik_grid.max()
     exact = jax.lax.Precision.HIGHEST
-    error = table - jnp.einsum("rs,sp->rp", jnp.asarray(_TO_DENSE), table[::_DENSE], precision=exact)
-    return for_returns(grid, image.kind, image.weight)._replace(
+    error = loglik_grid - jnp.einsum("rs,sp->rp", jnp.asarray(_TO_DENSE), loglik_grid[::_DENSE], precision=exact)
+    return for_returns(grid, image.pixel_class, image.weight)._replace(
         sigma_error=jnp.einsum("fr,rp->fp", jnp.asarray(_DENSE_TO_FINE), error, precision=exact),
         sigma_error_parts=jnp.einsum("kr,rp->kp", jnp.asarray(_DENSE_TO_PARTS), error, precision=exact),
     )
@@ -128,10 +128,10 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
     return step
 
 
-def near_peak(table: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -> NoiseGrid:
-    """The part of the grid, `count` coarse sigmas, about the best sigma of this table: at a fraction of the cost, and
-    what is left out has no mass where that sigma is near those of the scenes to come."""
-    first = jnp.clip(jnp.argmax(table.max(1)) - count // 2, 0, _SIGMA_STEPS - count)
+def near_peak(loglik_grid: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -> NoiseGrid:
+    """The part of the grid, `count` coarse sigmas, about the best sigma of these log likelihoods: at a
+    fraction of the cost, and what is left out has no mass where that sigma is near those of the scenes to come."""
+    first = jnp.clip(jnp.argmax(loglik_grid.max(1)) - count // 2, 0, _SIGMA_STEPS - count)
     fine = (len(grid.fine.sigma) - 1) // (_SIGMA_STEPS - 1)
     rows = (count - 1) * fine + 1
     part = jax.lax.dynamic_slice_in_dim
@@ -148,36 +148,36 @@ def near_peak(table: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -
     )
 
 
-def _fine(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N Sf Pf"]:
+def _fine(loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N Sf Pf"]:
     # Splines of large numbers lose their small differences in float32: interpolate about the peak.
-    peak = table.max((-2, -1), keepdims=True)
+    peak = loglik_grid.max((-2, -1), keepdims=True)
     exact = jax.lax.Precision.HIGHEST
-    rows = jnp.einsum("fs,nsp->nfp", grid.to_fine_sigma, table - peak, precision=exact)
+    rows = jnp.einsum("fs,nsp->nfp", grid.to_fine_sigma, loglik_grid - peak, precision=exact)
     fine = jnp.einsum("gp,nfp->nfg", grid.to_fine_p, rows, precision=exact)
     return fine + log_weight(grid)
 
 
 def log_weight(grid: NoiseGrid) -> Float[Array, "Sf Pf"]:
-    """What is added to splines of a table on the fine grid: the prior mass, and what splines are known to miss."""
+    """What is added to splines of log likelihoods on the fine grid: prior mass, and what splines miss."""
     exact = jax.lax.Precision.HIGHEST
     missed = jnp.einsum("gp,fp->fg", grid.to_fine_p, grid.sigma_error, precision=exact)
     return grid.log_mass + missed - grid.returns * grid.p_error
 
 
-def log_marginal(table: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N"]:
-    """log of the integral of exp(table) over the noise prior."""
-    return jax.nn.logsumexp(_fine(table, grid), (-2, -1)) + table.max((-2, -1))
+def log_marginal(loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "N"]:
+    """log of the integral of exp(loglik_grid) over the noise prior."""
+    return jax.nn.logsumexp(_fine(loglik_grid, grid), (-2, -1)) + loglik_grid.max((-2, -1))
 
 
-def sample(key: PRNGKeyArray, table: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
+def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
     """One draw of (sigma, p_outlier) per particle given its scene: sigma on the fine grid, p_outlier given it and then
     sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough to
     sum, but its step can be wider than a standard deviation of p_outlier: drawn evenly from it, 50 % intervals hold
     58 %."""
     s_key, p_key, sigma_key = jax.random.split(key, 3)
-    s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(table, grid), -1))
+    s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(loglik_grid, grid), -1))
     exact = jax.lax.Precision.HIGHEST
-    relative = table - table.max((-2, -1), keepdims=True)
+    relative = loglik_grid - loglik_grid.max((-2, -1), keepdims=True)
     given_sigma = jnp.einsum("ns,nsp->np", grid.to_fine_sigma[s], relative, precision=exact) + grid.sigma_error[s]
     ends_u, ends_v = jnp.log(grid.coarse.sigma), jnp.log(_odds(grid.coarse.p_outlier))
     # log(1 - p) of every return without the spline's error: its own spline taken out, itself put in.
@@ -211,8 +211,8 @@ def _odds(p: Float[Array, "..."]) -> Float[Array, "..."]:
     return p / (1 - p)
 
 
-def peak(table: Float[Array, "S P"], grid: NoiseGrid) -> Noise:
+def peak(loglik_grid: Float[Array, "S P"], grid: NoiseGrid) -> Noise:
     """The coarse grid's best (sigma, p_outlier), each an array of one, for searches at a single noise level."""
-    index = jnp.argmax(table)
-    columns = table.shape[-1]
+    index = jnp.argmax(loglik_grid)
+    columns = loglik_grid.shape[-1]
     return Noise(grid.coarse.sigma[index // columns][None], grid.coarse.p_outlier[index % columns][None])

@@ -9,13 +9,13 @@ from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import Noise, Pixels, log_likelihood
 from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
-from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.scored_image import Image, observed
+from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
 from bayes3d_ros.likelihood.tiled_render import crop, draw_tiles, over_depth, padding
 from bayes3d_ros.likelihood.tiles import LARGE, Tiles, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
-from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 
 
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
@@ -23,21 +23,23 @@ def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*
     return jnp.pad(depth, pad, constant_values=jnp.inf)
 
 
-def _drawn(contact: Contact, library: LibraryArrays, table: Table) -> Drawn:
+def _drawn(placement: Placement, library: LibraryArrays, table: Table) -> Drawn:
     """An object each."""
-    T = T_camera_object(contact, library, table)
-    return Drawn(contact.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
+    T = T_camera_object(placement, library, table)
+    return Drawn(placement.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
 
 
-def _drawing(contact: Contact, image: Image, library: LibraryArrays, table: Table) -> tuple[Callable, Callable]:
+def _drawing(
+    placement: Placement, image: ScoredImage, library: LibraryArrays, table: Table
+) -> tuple[Callable, Callable]:
     """Draws object n along rays; tiles of the objects' outlines, grown by so many pixels."""
-    T = T_camera_object(contact, library, table)
+    T = T_camera_object(placement, library, table)
 
     def draw(n, rays):
-        return march(library, contact.type[n], T[n], rays)
+        return march(library, placement.type[n], T[n], rays)
 
     def tiles(grown: int) -> Tiles:
-        return tiles_of_objects(T[:, None], contact.type[:, None], image, library, grown)
+        return tiles_of_objects(T[:, None], placement.type[:, None], image, library, grown)
 
     return draw, tiles
 
@@ -49,17 +51,17 @@ def _twice(pixels: Pixels) -> Pixels:
         layers = a.reshape(*a.shape[:2], -1, 1, LARGE.chunk)
         return jnp.concatenate([layers, layers], 3).reshape(*a.shape[:2], -1)
 
-    depth, kind, ray_x, ray_y = (both(a) for a in (pixels.depth, pixels.kind, pixels.ray_x, pixels.ray_y))
+    depth, pixel_class, ray_x, ray_y = (both(a) for a in (pixels.depth, pixels.pixel_class, pixels.ray_x, pixels.ray_y))
     beside = jax.tree.map(both, pixels.beside)
-    return pixels._replace(depth=depth, kind=kind, ray_x=ray_x, ray_y=ray_y, beside=beside)
+    return pixels._replace(depth=depth, pixel_class=pixel_class, ray_x=ray_x, ray_y=ray_y, beside=beside)
 
 
 @partial(jax.jit, static_argnames="window")
 def log_likelihood_gain(
-    contact: Contact,
+    placement: Placement,
     ancestor: Int[Array, "N"],
     scenes: Float[Array, "A Hp Wp"],
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     table: Table,
     noise: Noise,
@@ -70,10 +72,10 @@ def log_likelihood_gain(
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
     if gain_of := kernel(image):
-        drawn = _drawn(contact, library, table)
-        return gain_of(drawn, Scenes(scenes, ancestor), image, library, noise, window)
+        drawn = _drawn(placement, library, table)
+        return gain_of(drawn, SceneDepths(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
-    draw, tiles = _drawing(contact, image, library, table)
+    draw, tiles = _drawing(placement, image, library, table)
 
     def add(gains, n, u, v, depth, real):
         before = crop(scenes, ancestor[n], u, v, tile + 2 * half)
@@ -83,31 +85,31 @@ def log_likelihood_gain(
         gain = value[..., chunk:] - value[..., :chunk]
         return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
 
-    count = len(contact.type)
+    count = len(placement.type)
     gains = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
     return over_depth(add, gains, draw, tiles(0), tiles(half), count, image, half, LARGE)
 
 
 @partial(jax.jit, static_argnames="window")
 def draw_objects(
-    contact: Contact,
+    placement: Placement,
     scenes: Float[Array, "N Hp Wp"],
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     table: Table,
     window: int,
 ) -> Float[Array, "N Hp Wp"]:
     """Scene n with object n rendered into it."""
     if depth := depth_kernel():
-        return depth(_drawn(contact, library, table), scenes, image, library, window // 2)
-    draw, tiles = _drawing(contact, image, library, table)
+        return depth(_drawn(placement, library, table), scenes, image, library, window // 2)
+    draw, tiles = _drawing(placement, image, library, table)
     drawn = tiles(0)
     each = drawn.u.shape[0] // len(scenes)
     return draw_tiles(draw, scenes, drawn, (0, drawn.u.shape[0]), each, image, window // 2, LARGE)
 
 
 def log_likelihood_scene(
-    scenes: Float[Array, "A Hp Wp"], image: Image, noise: Noise, window: int
+    scenes: Float[Array, "A Hp Wp"], image: ScoredImage, noise: Noise, window: int
 ) -> Float[Array, "A S P"]:
     """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
     height, width = image.depth.shape

@@ -15,21 +15,21 @@ class FreePoints(NamedTuple):
     """Free 3D points by the pixels that they fall into, in L layers of at most one a pixel."""
 
     depth: Float[Array, "L H W"]  # their z
-    kind: Int[Array, "L H W"]
+    pixel_class: Int[Array, "L H W"]
     beside_x: Float[Array, "L H W"]  # x / z less that of the pixel's ray
     beside_y: Float[Array, "L H W"]
 
 
-class Image(NamedTuple):
+class ScoredImage(NamedTuple):
     """The observed depth at scoring resolution. The arrays may have more rows than the camera (see `scored_image`)."""
 
     depth: Float[Array, "H W"]  # metres, 0 where there is no return
-    kind: Int[Array, "H W"]
+    pixel_class: Int[Array, "H W"]
     ray_x: Float[Array, "W"]
     ray_y: Float[Array, "H"]
     focal: Float[Array, "2"]
     centre: Float[Array, "2"]
-    table: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
+    bare_depth: Float[Array, "H W"]  # depth of the bare table, inf where it is not seen or the pixel looks beyond it
     outlier_scale: Float[Array, ""]
     front_margin: Float[Array, ""]
     likelihood: Likelihood = Likelihood()
@@ -62,16 +62,17 @@ def array_shape(width: int, height: int, score_width: int) -> tuple[int, int]:
 def scored_image(
     camera: Intrinsics,
     depth: Float[np.ndarray, "height width"],
-    kind: Int[np.ndarray, "height width"],
-    table: Float[np.ndarray, "height width"],
+    pixel_class: Int[np.ndarray, "height width"],
+    bare_depth: Float[np.ndarray, "height width"],
     near: float,
     far: float,
     sigma_max: float,
     **more: Any,
-) -> Image:
+) -> ScoredImage:
     """The image of a camera at scoring resolution, in arrays of `padded_height` rows: below the camera's nothing
-    returned. What is computed of the image does not depend on them. depth: metres, 0 where there is no return; table:
-    that of the bare table, inf where it is not seen; near, far, sigma_max: metres; `more`: other fields of the image.
+    returned. What is computed of the image does not depend on them. depth: metres, 0 where there is no return;
+    bare_depth: that of the bare table, inf where it is not seen; near, far, sigma_max: metres; `more`: other
+    fields of the image.
 
     All arrays are numpy's, to be put on a device: JAX would compile the padding itself for every size.
     """
@@ -79,47 +80,47 @@ def scored_image(
     below = padded_height(camera.width, camera.height) - camera.height
     rows_below = rays[-1, 0, 1] + np.arange(1, below + 1) / camera.fy
 
-    def grown(a: np.ndarray, kind: type, nothing: float) -> np.ndarray:
-        return np.pad(a.astype(kind), [(0, below), (0, 0)], constant_values=nothing)
+    def grown(a: np.ndarray, dtype: type, nothing: float) -> np.ndarray:
+        return np.pad(a.astype(dtype), [(0, below), (0, 0)], constant_values=nothing)
 
     fields: dict[str, Any] = {
         "depth": grown(depth, np.float32, 0.0),
-        "kind": grown(kind, np.int32, NO_RETURN),
+        "pixel_class": grown(pixel_class, np.int32, NO_RETURN),
         "ray_x": rays[0, :, 0].copy(),
         "ray_y": np.concatenate([rays[:, 0, 1], rows_below]).astype(np.float32),
         "focal": np.array([camera.fx, camera.fy], np.float32),
         "centre": np.array([camera.cx, camera.cy], np.float32),
-        "table": grown(table, np.float32, np.inf),
+        "bare_depth": grown(bare_depth, np.float32, np.inf),
         "outlier_scale": np.float32(3 / (far**3 - near**3)),
         "front_margin": np.float32(3 * sigma_max),
         "rows": np.int32(camera.height),
     }
-    return Image(**fields, **more)
+    return ScoredImage(**fields, **more)
 
 
-def halved(image: Image) -> Image:
+def halved(image: ScoredImage) -> ScoredImage:
     """Every second pixel of every second row: the same camera at half the resolution, a quarter of the work."""
     return image._replace(
         depth=image.depth[::2, ::2],
-        kind=image.kind[::2, ::2],
+        pixel_class=image.pixel_class[::2, ::2],
         ray_x=image.ray_x[::2],
         ray_y=image.ray_y[::2],
         focal=image.focal / 2,
         centre=image.centre / 2,
-        table=image.table[::2, ::2],
+        bare_depth=image.bare_depth[::2, ::2],
         points=None,  # good enough for a search
         rows=None if image.rows is None else (image.rows + 1) // 2,
     )
 
 
-def at_most(image: Image, width: int) -> Image:
+def at_most(image: ScoredImage, width: int) -> ScoredImage:
     """The image halved until it is no wider than so many pixels."""
     while image.depth.shape[1] > width:
         image = halved(image)
     return image
 
 
-def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
+def observed(image: ScoredImage, u, v, shape: tuple[int, int]) -> Pixels:
     """The observed pixels of tiles of a shape; those that stick out of the image have no return."""
     height, width = image.depth.shape
     rows, columns = (v + jnp.arange(shape[0])[:, None])[:, None], u + jnp.arange(shape[1])[:, None]
@@ -127,7 +128,7 @@ def observed(image: Image, u, v, shape: tuple[int, int]) -> Pixels:
     rows, columns = jnp.minimum(rows, height - 1), jnp.minimum(columns, width - 1)
     pixels = Pixels(
         depth=image.depth[rows, columns],
-        kind=jnp.where(inside, image.kind[rows, columns], NO_RETURN),
+        pixel_class=jnp.where(inside, image.pixel_class[rows, columns], NO_RETURN),
         ray_x=jnp.broadcast_to(image.ray_x[columns], inside.shape),
         ray_y=jnp.broadcast_to(image.ray_y[rows], inside.shape),
         step_x=1 / image.focal[0],
@@ -147,10 +148,10 @@ def _observed_points(points: FreePoints, pixels: Pixels, rows, columns, inside) 
     def in_every_layer(a: Array) -> Array:
         return jnp.concatenate([a] * count, -1)
 
-    depth, kind, x, y = (jnp.concatenate(list(a[:, rows, columns]), -1) for a in points)
+    depth, pixel_class, x, y = (jnp.concatenate(list(a[:, rows, columns]), -1) for a in points)
     return pixels._replace(
         depth=depth,
-        kind=jnp.where(in_every_layer(inside), kind, NO_RETURN),
+        pixel_class=jnp.where(in_every_layer(inside), pixel_class, NO_RETURN),
         ray_x=in_every_layer(pixels.ray_x),
         ray_y=in_every_layer(pixels.ray_y),
         beside=(x, y),

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.tiles import Tiles, TileSize, over_tiles
 
 _BATCH_PIXELS = 1 << 20  # of the images that are drawn at a time
@@ -29,7 +29,7 @@ def draw_tiles(
     tiles: Tiles,
     rows,
     each: int,
-    image: Image,
+    image: ScoredImage,
     half: int,
     size: TileSize,
 ) -> Float[Array, "B Hp Wp"]:
@@ -65,7 +65,7 @@ def over_depth(
     drawn: Tiles,
     scored: Tiles,
     count: int,
-    image: Image,
+    image: ScoredImage,
     half: int,
     size: TileSize,
 ):

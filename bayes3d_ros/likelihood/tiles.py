@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
@@ -50,7 +50,7 @@ BEHIND = 0.02  # metres: what is nearer is taken to lie behind the camera
 def tiles_of_objects(
     T_camera_object: Float[Array, "N K 4 4"],
     type_index: Int[Array, "N K"],
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     half: int,
     everywhere: Bool[Array, ""] | bool = False,

@@ -45,7 +45,7 @@ class LibraryArrays(NamedTuple):
     sketch_normal: Float[Array, "K P 3"]
     sketch_area: Float[Array, "K"]  # metres^2 that one of them stands for
     solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
-    alike_face: Int[Array, "K 6 A"]  # contacts that look like each other (`self_symmetry.py`)
+    alike_face: Int[Array, "K 6 A"]  # placements that look like each other (`self_symmetry.py`)
     alike_shift: Float[Array, "K 6 A 3"]  # along the contact's own x and y, and yaw
 
 

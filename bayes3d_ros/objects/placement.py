@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.objects.library_arrays import EMPTY, NUM_FACES, LibraryArrays
 
 
-class Contact(NamedTuple):
+class Placement(NamedTuple):
     """Objects on the table: discrete type and contact face, box centre (x, y) in metres and yaw in radians, all in the
     table frame (z up)."""
 
@@ -19,12 +19,12 @@ class Contact(NamedTuple):
     yaw: Float[Array, "*batch"]
 
 
-def shifted(contact: Contact, face: Int[Array, "*batch"], shift: Float[Array, "*batch 3"]) -> Contact:
-    """On another face, moved by (x, y) along the contact's own axes and turned by yaw."""
-    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
-    x = contact.x + c * shift[..., 0] - s * shift[..., 1]
-    y = contact.y + s * shift[..., 0] + c * shift[..., 1]
-    return Contact(contact.type, face, x, y, contact.yaw + shift[..., 2])
+def shifted(placement: Placement, face: Int[Array, "*batch"], shift: Float[Array, "*batch 3"]) -> Placement:
+    """On another face, moved by (x, y) along the placement's own axes and turned by yaw."""
+    c, s = jnp.cos(placement.yaw), jnp.sin(placement.yaw)
+    x = placement.x + c * shift[..., 0] - s * shift[..., 1]
+    y = placement.y + s * shift[..., 0] + c * shift[..., 1]
+    return Placement(placement.type, face, x, y, placement.yaw + shift[..., 2])
 
 
 class Table(NamedTuple):
@@ -34,46 +34,46 @@ class Table(NamedTuple):
     size: Float[Array, "2"]
 
 
-def T_table_object(contact: Contact, library: LibraryArrays) -> Float[Array, "*batch 4 4"]:
-    """The pose that a contact stands for: Trans(x, y, 0) Rot_z(yaw) T_contact_object."""
-    c, s = jnp.cos(contact.yaw), jnp.sin(contact.yaw)
-    zero, one = jnp.zeros_like(contact.yaw), jnp.ones_like(contact.yaw)
+def T_table_object(placement: Placement, library: LibraryArrays) -> Float[Array, "*batch 4 4"]:
+    """The pose that a placement stands for: Trans(x, y, 0) Rot_z(yaw) T_contact_object."""
+    c, s = jnp.cos(placement.yaw), jnp.sin(placement.yaw)
+    zero, one = jnp.zeros_like(placement.yaw), jnp.ones_like(placement.yaw)
     slide = jnp.stack(
         [
-            jnp.stack([c, -s, zero, contact.x], -1),
-            jnp.stack([s, c, zero, contact.y], -1),
+            jnp.stack([c, -s, zero, placement.x], -1),
+            jnp.stack([s, c, zero, placement.y], -1),
             jnp.stack([zero, zero, one, zero], -1),
             jnp.stack([zero, zero, zero, one], -1),
         ],
         -2,
     )
     # Written out: matrix multiplication may run at reduced precision on some backends.
-    resting = library.T_contact_object[contact.type, contact.face]
+    resting = library.T_contact_object[placement.type, placement.face]
     return (slide[..., :, :, None] * resting[..., None, :, :]).sum(-2)
 
 
-def T_camera_object(contact: Contact, library: LibraryArrays, table: Table) -> Float[Array, "*batch 4 4"]:
-    return (table.T_camera_table[:, :, None] * T_table_object(contact, library)[..., None, :, :]).sum(-2)
+def T_camera_object(placement: Placement, library: LibraryArrays, table: Table) -> Float[Array, "*batch 4 4"]:
+    return (table.T_camera_table[:, :, None] * T_table_object(placement, library)[..., None, :, :]).sum(-2)
 
 
-def log_prior(contact: Contact, library: LibraryArrays, table: Table) -> Float[Array, "*batch"]:
+def log_prior(placement: Placement, library: LibraryArrays, table: Table) -> Float[Array, "*batch"]:
     """log p(type, face, x, y, yaw): uniform over types and faces, over the table's rectangle shrunk by the face's width
     and height, and over [0, 2 pi). Density per metre^2 and radian. Minus infinity outside."""
-    free = jnp.maximum(table.size - library.face_size[contact.type, contact.face], 1e-3)
-    inside = (jnp.abs(contact.x) <= free[..., 0] / 2) & (jnp.abs(contact.y) <= free[..., 1] / 2)
-    inside &= (contact.type >= 0) & (contact.type < library.num_types)
+    free = jnp.maximum(table.size - library.face_size[placement.type, placement.face], 1e-3)
+    inside = (jnp.abs(placement.x) <= free[..., 0] / 2) & (jnp.abs(placement.y) <= free[..., 1] / 2)
+    inside &= (placement.type >= 0) & (placement.type < library.num_types)
     log_p = -jnp.log(library.num_types * NUM_FACES * free[..., 0] * free[..., 1] * 2 * jnp.pi)
     return jnp.where(inside, log_p, -jnp.inf)
 
 
-def overlap(a: Contact, b: Contact, library: LibraryArrays) -> Float[Array, "*batch"]:
+def overlap(a: Placement, b: Placement, library: LibraryArrays) -> Float[Array, "*batch"]:
     """How much two solids interpenetrate: of points spread in one the share that lies in the other, the larger way."""
     T_a, T_b = T_table_object(a, library), T_table_object(b, library)
     return jnp.maximum(_share_inside(a, T_a, b, T_b, library), _share_inside(b, T_b, a, T_a, library))
 
 
 def _share_inside(
-    a: Contact, T_a: Float[Array, "*batch 4 4"], b: Contact, T_b: Float[Array, "*batch 4 4"], library: LibraryArrays
+    a: Placement, T_a: Float[Array, "*batch 4 4"], b: Placement, T_b: Float[Array, "*batch 4 4"], library: LibraryArrays
 ) -> Float[Array, "*batch"]:
     points = library.solid[a.type]
     world = (T_a[..., None, :3, :3] * points[..., :, None, :]).sum(-1) + T_a[..., None, :3, 3]

@@ -23,8 +23,8 @@ _SAME_TURN = 0.35  # radians: closer poses on one face are one mode
 
 
 class Lookalikes(NamedTuple):
-    """For each contact face, the other contacts that look alike, best first; the contact itself where there are fewer.
-    `shift` is (x, y) in metres along the contact's own axes, and yaw in radians, added to the contact's."""
+    """For each contact face, the faces on which the object looks alike, best first; the face itself where there are
+    fewer. `shift` is (x, y) in metres along the placement's own axes, and yaw in radians, added to the placement's."""
 
     face: Int[np.ndarray, "6 A"]
     shift: Float[np.ndarray, "6 A 3"]

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
-from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.coarse_search import Evidence
 
 _ROUNDS = 10
@@ -15,17 +15,17 @@ _WIDE, _TIGHT = 0.02, 0.006  # metres, how far off a point may be, first and las
 
 
 def align(
-    contact: Contact, evidence: Evidence, image: Image, library: LibraryArrays, table: Table
-) -> tuple[Contact, Float[Array, "N 3 3"]]:
+    placement: Placement, evidence: Evidence, image: ScoredImage, library: LibraryArrays, table: Table
+) -> tuple[Placement, Float[Array, "N 3 3"]]:
     """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over sketch points, per metre^2 of
     residual variance."""
     R_table, t_table = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     axes = [R_table[:, a] for a in range(3)]
     height, width = evidence.depth.shape
 
-    def step(contact: Contact, tolerance: Float[Array, ""]):
-        T = T_camera_object(contact, library, table)
-        points, normals = library.sketch[contact.type], library.sketch_normal[contact.type]
+    def step(placement: Placement, tolerance: Float[Array, ""]):
+        T = T_camera_object(placement, library, table)
+        points, normals = library.sketch[placement.type], library.sketch_normal[placement.type]
         p = (T[:, None, :3, :3] * points[:, :, None, :]).sum(-1) + T[:, None, :3, 3]
         n = (T[:, None, :3, :3] * normals[:, :, None, :]).sum(-1)
         z = jnp.maximum(p[..., 2], 0.02)
@@ -41,7 +41,7 @@ def align(
         facing = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
         weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & (facing > 0.15), 1.0, 0.0)
         weight = weight * evidence.unexplained[v, u] / (1 + (residual / tolerance) ** 2) ** 2
-        centre = contact.x[:, None] * axes[0] + contact.y[:, None] * axes[1] + t_table
+        centre = placement.x[:, None] * axes[0] + placement.y[:, None] * axes[1] + t_table
         turn = jnp.cross(axes[2], p - centre[:, None])
         J = jnp.stack([(n * axes[0]).sum(-1), (n * axes[1]).sum(-1), (n * turn).sum(-1)], -1)
         information = jnp.einsum("np,npa,npb->nab", weight, J, J)
@@ -49,9 +49,11 @@ def align(
         damped = information + jnp.diag(tolerance**2 / jnp.array([0.02, 0.02, 0.3]) ** 2)
         move = jnp.linalg.solve(damped, jnp.einsum("np,npa,np->na", weight, J, residual)[..., None])[..., 0]
         move = jnp.clip(move, -jnp.array([0.01, 0.01, 0.15]), jnp.array([0.01, 0.01, 0.15]))
-        moved = contact._replace(x=contact.x + move[:, 0], y=contact.y + move[:, 1], yaw=contact.yaw + move[:, 2])
+        moved = placement._replace(
+            x=placement.x + move[:, 0], y=placement.y + move[:, 1], yaw=placement.yaw + move[:, 2]
+        )
         return moved, information
 
     tolerances = _WIDE * (_TIGHT / _WIDE) ** jnp.linspace(0, 1, _ROUNDS)
-    contact, information = jax.lax.scan(step, contact, tolerances)
-    return contact, information[-1]
+    placement, information = jax.lax.scan(step, placement, tolerances)
+    return placement, information[-1]

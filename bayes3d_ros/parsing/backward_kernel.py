@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.search import Context
 
 _FLOOR = 0.02
@@ -22,33 +22,33 @@ class Empty(NamedTuple):
     """The empty table."""
 
     scene: Float[Array, "1 Hp Wp"]
-    table: Float[Array, "1 S P"]  # log p(image | empty, noise) up to a constant
+    loglik_grid: Float[Array, "1 S P"]  # log p(image | empty, noise) up to a constant
     log_likelihood: Float[Array, "1"]
 
 
 def empty_table(context: Context, grid: NoiseGrid, window: int) -> Empty:
-    scene = pad_scene(context.image.table, window)[None]
-    table = log_likelihood_scene(scene, context.image, grid.coarse, window)
-    table = table - table.max()
-    return Empty(scene, table, log_marginal(table, grid))
+    scene = pad_scene(context.image.bare_depth, window)[None]
+    loglik_grid = log_likelihood_scene(scene, context.image, grid.coarse, window)
+    loglik_grid = loglik_grid - loglik_grid.max()
+    return Empty(scene, loglik_grid, log_marginal(loglik_grid, grid))
 
 
-def gain_alone(new: Contact, empty: Empty, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N"]:
+def solo_gain_of(new: Placement, empty: Empty, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N"]:
     """Nats that each object gains over the empty table."""
     gain = log_likelihood_gain(new, jnp.zeros_like(new.type), empty.scene, *context, grid.coarse, window)
-    return log_marginal(empty.table + gain, grid) - empty.log_likelihood
+    return log_marginal(empty.loglik_grid + gain, grid) - empty.log_likelihood
 
 
-def log_last(alone: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
+def log_last(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
     """log of k times the backward kernel: the chance that the object in slot `count` came last of the k = count + 1."""
-    present = jnp.arange(alone.shape[1]) <= count
-    share = jax.nn.softmax(jnp.where(present, -alone, -jnp.inf), 1)
+    present = jnp.arange(solo_gain.shape[1]) <= count
+    share = jax.nn.softmax(jnp.where(present, -solo_gain, -jnp.inf), 1)
     share = (1 - _FLOOR) * share + _FLOOR * present / (count + 1)
     return jnp.log((count + 1) * share[:, count])
 
 
-def log_order(alone: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
+def log_order(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
     """log of the product of the kernels of all stages: how likely this order of `count` objects is, but a constant."""
-    slots = jnp.arange(alone.shape[1])
-    each = jax.vmap(log_last, (None, 0))(alone, slots)
+    slots = jnp.arange(solo_gain.shape[1])
+    each = jax.vmap(log_last, (None, 0))(solo_gain, slots)
     return jnp.where((slots < count)[:, None], each, 0.0).sum(0)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
-from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 
 CELL = 0.02  # metres
 YAWS = 24
@@ -35,9 +35,9 @@ class Evidence(NamedTuple):
 
 
 def sketch_score(
-    contact: Contact,
+    placement: Placement,
     evidence: Evidence,
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     table: Table,
     tolerance: float,
@@ -46,9 +46,9 @@ def sketch_score(
 ) -> Float[Array, "N"]:
     """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
     past, relative to the reward of one that matches; the first `points` of the sketch are used."""
-    T = T_camera_object(contact, library, table)
-    point, normal = _placed(T, contact.type, library, points)
-    return _score(point, normal, _area(library, points)[contact.type], evidence, image, tolerance, penalty)
+    T = T_camera_object(placement, library, table)
+    point, normal = _placed(T, placement.type, library, points)
+    return _score(point, normal, _area(library, points)[placement.type], evidence, image, tolerance, penalty)
 
 
 class _Vectors(NamedTuple):
@@ -60,7 +60,7 @@ class _Vectors(NamedTuple):
 
 
 def _placed(
-    T: Float[Array, "N 4 4"], kind: Int[Array, "N"], library: LibraryArrays, points: int
+    T: Float[Array, "N 4 4"], type_id: Int[Array, "N"], library: LibraryArrays, points: int
 ) -> tuple[_Vectors, _Vectors]:
     """The first `points` of the sketch and their normals in the camera frame."""
     rotation, translation = T[:, :3, :3], T[:, :3, 3]
@@ -69,9 +69,9 @@ def _placed(
         r, (x, y, z) = rotation[..., None], (vectors[..., a] for a in range(3))
         return _Vectors(*(r[:, a, 0] * x + r[:, a, 1] * y + r[:, a, 2] * z for a in range(3)))
 
-    point = turned(library.sketch[kind, :points])
+    point = turned(library.sketch[type_id, :points])
     placed = _Vectors(*(along + translation[:, a][:, None] for a, along in enumerate(point)))
-    return placed, turned(library.sketch_normal[kind, :points])
+    return placed, turned(library.sketch_normal[type_id, :points])
 
 
 def _score(
@@ -79,7 +79,7 @@ def _score(
     normal: _Vectors,
     area: Float[Array, "N"],
     evidence: Evidence,
-    image: Image,
+    image: ScoredImage,
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "N"]:
@@ -108,7 +108,7 @@ def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
 
 
 def cells_to_search(
-    evidence: Evidence, image: Image, table: Table, shape: tuple[int, int]
+    evidence: Evidence, image: ScoredImage, table: Table, shape: tuple[int, int]
 ) -> tuple[Float[Array, "C 2"], Int[Array, ""]]:
     """Centres of the cells near unexplained returns, those with the most first, and how many there are."""
     xy = table_xy(evidence.depth, image, table)
@@ -124,7 +124,7 @@ def cells_to_search(
     return centre, (best >= 8).sum()
 
 
-def table_xy(depth: Float[Array, "H W"], image: Image, table: Table) -> Float[Array, "H W 2"]:
+def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Float[Array, "H W 2"]:
     """Where each return stands on the table."""
     R, t = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     point = [depth * image.ray_x[None, :] - t[0], depth * image.ray_y[:, None] - t[1], depth - t[2]]
@@ -135,7 +135,7 @@ def score_cells(
     centres: Float[Array, "C 2"],
     count: Int[Array, ""],
     evidence: Evidence,
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
@@ -144,13 +144,13 @@ def score_cells(
         return cells_in_turn(centres, count, evidence, image, library, table)
     from bayes3d_ros.parsing.coarse_search_cpu import sketch_scores  # takes a while to import
 
-    kinds, (face, yaw) = library.first.shape[0], _ways()
+    types, (face, yaw) = library.first.shape[0], _ways()
     tolerance, penalty, points = _COARSE
-    shape = (kinds, len(face))
-    kind, face, yaw = (jnp.broadcast_to(a, shape).ravel() for a in (jnp.arange(kinds)[:, None], face, yaw))
+    shape = (types, len(face))
+    type_id, face, yaw = (jnp.broadcast_to(a, shape).ravel() for a in (jnp.arange(types)[:, None], face, yaw))
     zero = jnp.zeros(face.shape)
-    T = T_camera_object(Contact(kind, face, zero, zero, yaw), library, table)
-    point, normal = (jnp.stack(v).reshape(3, *shape, points) for v in _placed(T, kind, library, points))
+    T = T_camera_object(Placement(type_id, face, zero, zero, yaw), library, table)
+    point, normal = (jnp.stack(v).reshape(3, *shape, points) for v in _placed(T, type_id, library, points))
     scores = sketch_scores(
         point,
         normal,
@@ -163,7 +163,7 @@ def score_cells(
         tolerance,
         penalty,
     )
-    return scores.reshape(-1, kinds, NUM_FACES, YAWS)
+    return scores.reshape(-1, types, NUM_FACES, YAWS)
 
 
 def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
@@ -181,23 +181,23 @@ def cells_in_turn(
     centres: Float[Array, "C 2"],
     count: Int[Array, ""],
     evidence: Evidence,
-    image: Image,
+    image: ScoredImage,
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
     """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
-    kinds, (face, yaw) = library.first.shape[0], _ways()
+    types, (face, yaw) = library.first.shape[0], _ways()
     ways = NUM_FACES * YAWS
     tolerance, penalty, points = _COARSE
     blocks = -(-count // _BLOCK)
     along = [table.T_camera_table[:3, axis] for axis in range(2)]
 
-    def of_kind(kind: Int[Array, ""], scores: Array) -> Array:
+    def of_type(type_id: Int[Array, ""], scores: Array) -> Array:
         zero = jnp.zeros(ways)
-        at_origin = Contact(jnp.full(ways, kind), face, zero, zero, yaw)
+        at_origin = Placement(jnp.full(ways, type_id), face, zero, zero, yaw)
         # Turned once for all cells.
         point, normal = _placed(T_camera_object(at_origin, library, table), at_origin.type, library, points)
-        area = _area(library, points)[kind]
+        area = _area(library, points)[type_id]
 
         def of_block(block: Int[Array, ""], scores: Array) -> Array:
             xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))
@@ -205,15 +205,15 @@ def cells_in_turn(
             here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
             value = _score(here, normal, area, evidence, image, tolerance, penalty)
             value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
-            return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, kind, 0, 0))
+            return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, type_id, 0, 0))
 
         return jax.lax.fori_loop(0, blocks, of_block, scores)
 
-    scores = jnp.full((centres.shape[0], kinds, NUM_FACES, YAWS), -jnp.inf)
-    return jax.lax.fori_loop(0, library.num_types, of_kind, scores)
+    scores = jnp.full((centres.shape[0], types, NUM_FACES, YAWS), -jnp.inf)
+    return jax.lax.fori_loop(0, library.num_types, of_type, scores)
 
 
-def hidden_cells(image: Image, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:
+def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:
     """How little the image says of something small in each cell: 1 where it would be hidden, falling with the number of
     heights above the cell at which the camera sees past."""
     heights = jnp.array([0.01, 0.02, 0.035, 0.05, 0.07])
@@ -226,5 +226,5 @@ def hidden_cells(image: Image, table: Table, shape: tuple[int, int]) -> Float[Ar
     height, width = image.depth.shape
     seen = ((uv >= 0) & (uv < jnp.array([width, height]))).all(-1) & (point[..., 2] > 0.02)
     u, v = jnp.clip(uv[..., 0], 0, width - 1), jnp.clip(uv[..., 1], 0, height - 1)
-    past = seen & (image.kind[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
+    past = seen & (image.pixel_class[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
     return jnp.exp(-1.5 * past.sum(-1))

@@ -143,14 +143,14 @@ def _sum(area, first, count):
 
 
 @_lanes
-def _score(point, normal, worth, moved, image, kinds, ways, size, count, num_types, points, scores):
+def _score(point, normal, worth, moved, image, types, ways, size, count, num_types, points, scores):
     for k in range(u64(len(scores))):
         scores[k] = f32(-np.inf)
-    stride = kinds * ways * size
-    for kind in range(num_types):
+    stride = types * ways * size
+    for type_id in range(num_types):
         for way in range(0, ways, _AT_ONCE):
             some = min(_AT_ONCE, ways - way)
-            first, full = (kind * ways + way) * size, some * size
+            first, full = (type_id * ways + way) * size, some * size
             for place in range(count):
                 _project(
                     point, normal, first, full, stride, moved[3 * place], moved[3 * place + 1], moved[3 * place + 2],
@@ -158,9 +158,9 @@ def _score(point, normal, worth, moved, image, kinds, ways, size, count, num_typ
                 )  # fmt: skip
                 _look_up(image, points, full)
                 _weigh(image, points, full)
-                to = (place * kinds + kind) * ways + way
+                to = (place * types + type_id) * ways + way
                 for k in range(some):
-                    scores[to + k] = worth[kind] * _sum(points.area, k * size, size)
+                    scores[to + k] = worth[type_id] * _sum(points.area, k * size, size)
 
 
 @cfunc(types.int64(types.int64), cache=True)
@@ -169,14 +169,14 @@ def _sketch(frame):
     if answered_version(frame):
         return 0
     numbers, sizes = floats(frame, 7), integers(frame, 8)
-    places, kinds = min(sizes[5], i32(len(floats(frame, 3)) // 3)), min(sizes[6], sizes[2])
+    places, types = min(sizes[5], i32(len(floats(frame, 3)) // 3)), min(sizes[6], sizes[2])
     image = _Image(
         floats(frame, 4), floats(frame, 5), floats(frame, 6), sizes[0], sizes[1],
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
     _score(
         floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), image, np.int64(sizes[2]),
-        np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(kinds),
+        np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(types),
         _new_points(_AT_ONCE * sizes[4]), float_results(frame, 0),
     )  # fmt: skip
     return 0

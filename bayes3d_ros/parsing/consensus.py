@@ -10,7 +10,9 @@ _WITHIN = 0.02  # of the depth: returns of one surface
 _FEWEST = 3  # returns that make a surface
 
 
-def consensus(depth: Float[Array, "H W"], kind: Int[Array, "H W"]) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
+def consensus(
+    depth: Float[Array, "H W"], pixel_class: Int[Array, "H W"]
+) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
     """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
     where fewer than three agree."""
     height, width = depth.shape
@@ -20,7 +22,7 @@ def consensus(depth: Float[Array, "H W"], kind: Int[Array, "H W"]) -> tuple[Floa
         padded = jnp.pad(a, _REACH)
         return jnp.stack([padded[v : v + height, u : u + width] for v in range(size) for u in range(size)])
 
-    depths, kinds = about(depth), about(kind)
+    depths, classes = about(depth), about(pixel_class)
 
     def better(j: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
         chosen, most = best
@@ -30,5 +32,5 @@ def consensus(depth: Float[Array, "H W"], kind: Int[Array, "H W"]) -> tuple[Floa
     # The pixel's own return comes first: it stays where no other has more support.
     own = jnp.full(depth.shape, len(depths) // 2)
     chosen, most = jax.lax.fori_loop(0, len(depths), better, better(own[0, 0], (own, jnp.zeros_like(own))))
-    depth, kind = (jnp.take_along_axis(a, chosen[None], 0)[0] for a in (depths, kinds))
-    return jnp.where(most >= _FEWEST, depth, 0.0), kind
+    depth, pixel_class = (jnp.take_along_axis(a, chosen[None], 0)[0] for a in (depths, classes))
+    return jnp.where(most >= _FEWEST, depth, 0.0), pixel_class

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import LibraryArrays
-from bayes3d_ros.objects.placement import Contact, Table, log_prior, shifted
+from bayes3d_ros.objects.placement import Placement, Table, log_prior, shifted
 from bayes3d_ros.objects.self_symmetry import ALIKE
 from bayes3d_ros.parsing.proposal import Modes, draw_modes, log_density_modes, refit
 from bayes3d_ros.sampling.resampling import effective_fraction
@@ -29,14 +29,14 @@ _SMALLEST_SPREAD, _LARGEST_SPREAD = (2e-5, 2e-5, 2e-4), (0.05, 0.05, 2.0)  # met
 class Hypotheses(NamedTuple):
     """Objects, with how far off in (x, y, yaw) each may be."""
 
-    contact: Contact  # [N]
+    placement: Placement  # [N]
     scale: Float[Array, "N 3 3"]  # lower Cholesky factor of the covariance
 
 
 class Pilots(NamedTuple):
     """Draws that a mixture was fitted to, once they told what they could."""
 
-    contact: Contact  # [D]
+    placement: Placement  # [D]
     log_target: Float[Array, "D"]  # up to a constant
     log_drawn: Float[Array, "D"]  # log density of what drew them
 
@@ -81,20 +81,20 @@ def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M
     return weights(jnp.exp(low))
 
 
-def _draw_about(contact: Contact, offset: Float[Array, "M D 3"]) -> Contact:
+def _draw_about(placement: Placement, offset: Float[Array, "M D 3"]) -> Placement:
     """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
     count = offset.shape[1]
-    return Contact(
-        jnp.repeat(contact.type[:, None], count, 1),
-        jnp.repeat(contact.face[:, None], count, 1),
-        contact.x[:, None] + offset[..., 0],
-        contact.y[:, None] + offset[..., 1],
-        contact.yaw[:, None] + offset[..., 2],
+    return Placement(
+        jnp.repeat(placement.type[:, None], count, 1),
+        jnp.repeat(placement.face[:, None], count, 1),
+        placement.x[:, None] + offset[..., 0],
+        placement.y[:, None] + offset[..., 1],
+        placement.yaw[:, None] + offset[..., 2],
     )
 
 
-def _move(contact: Contact, step: Float[Array, "M 3"]) -> Contact:
-    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=contact.yaw + step[:, 2])
+def _move(placement: Placement, step: Float[Array, "M 3"]) -> Placement:
+    return placement._replace(x=placement.x + step[:, 0], y=placement.y + step[:, 1], yaw=placement.yaw + step[:, 2])
 
 
 def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypotheses, Float[Array, "M"]]:
@@ -103,10 +103,10 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
     and theirs."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
-        contact, scale = state
-        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*contact.type.shape, _DRAWS, 3)))
+        placement, scale = state
+        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*placement.type.shape, _DRAWS, 3)))
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
-        value = gains(jax.tree.map(jnp.ravel, _draw_about(contact, offset))).reshape(offset.shape[:2])
+        value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
         value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
         weight = _temper(value, 5.0)
         centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
@@ -114,7 +114,7 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
         covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
-        return Hypotheses(_move(contact, best), factor(covariance)), value.max(1)
+        return Hypotheses(_move(placement, best), factor(covariance)), value.max(1)
 
     modes, values = jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))
     return modes, values[-1]
@@ -127,9 +127,9 @@ def sharpen(
     mode's covariance. Returns the modes and the best log likelihood met."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
-        contact, scale = state
-        step = jax.random.normal(key, (*contact.type.shape, draws, 3)).at[:, 0].set(0.0)
-        about = _draw_about(contact, jnp.einsum("mab,mdb->mda", scale, step))
+        placement, scale = state
+        step = jax.random.normal(key, (*placement.type.shape, draws, 3)).at[:, 0].set(0.0)
+        about = _draw_about(placement, jnp.einsum("mab,mdb->mda", scale, step))
         value = gains(jax.tree.map(jnp.ravel, about)).reshape(step.shape[:2])
         value = jnp.maximum(value, -1e9)
         best = jnp.argmax(value, 1)
@@ -153,7 +153,7 @@ def sharpen(
         off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
         top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
         inverse = jnp.einsum("mab,mb,mcb->mac", along, 1 / value_along, along)
-        moved = _move(contact, jnp.einsum("mab,mb->ma", scale, top))
+        moved = _move(placement, jnp.einsum("mab,mb->ma", scale, top))
         return Hypotheses(moved, _bounded(scale @ jnp.linalg.cholesky(inverse))), value.max(1)
 
     modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
@@ -195,10 +195,10 @@ def adapt(
     return modes, pilots
 
 
-def log_shares(mass: Float[Array, "M"], kind: Int[Array, "M"]) -> Float[Array, "M"]:
+def log_shares(mass: Float[Array, "M"], type_id: Int[Array, "M"]) -> Float[Array, "M"]:
     """Log shares of draws for modes of these log masses and types: flatter than the masses, and flatter yet between
     types. However many modes the likely type has, another of a few percent is drawn often enough to be weighed."""
-    same = kind[:, None] == kind
+    same = type_id[:, None] == type_id
     mass = jnp.maximum(mass, mass.max() - 1e4)  # a type of which no pilot was drawn
 
     def of_type(value: Float[Array, "M"]) -> Float[Array, "M"]:
@@ -232,4 +232,4 @@ def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
     scale = _INFLATION**0.5 * modes.scale
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
-    return Modes(modes.contact, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))
+    return Modes(modes.placement, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))

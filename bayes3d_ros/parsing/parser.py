@@ -16,10 +16,10 @@ from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.likelihood.noise import NoiseGrid
-from bayes3d_ros.likelihood.scored_image import Image, array_shape, scored_image
+from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape, scored_image
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact, Table
+from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.reconstruction import compile_drawing, draw_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
@@ -37,7 +37,7 @@ _NO_SAMPLE = -30.0  # nats: samples of less weight are not kept
 class _Stage(NamedTuple):
     """What is kept of the scenes of k objects."""
 
-    objects: Contact
+    objects: Placement
     offset: Float[np.ndarray, "N M 3"]  # of each object against its picture: x, y, yaw
     plane: Float[np.ndarray, "N 3"]  # the table against the plane taken for it: two tilts, height
     log_weight: Float[np.ndarray, "N"]
@@ -82,8 +82,8 @@ class SceneParser:
         above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
         T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
         depth = above / np.maximum(camera.rays()[..., 1] * c + s, 0.2)
-        kind = np.full(depth.shape, IN_WORKSPACE)
-        image, table = self._image(camera, depth, kind, np.linalg.inv(T_table_camera))
+        pixel_class = np.full(depth.shape, IN_WORKSPACE)
+        image, table = self._image(camera, depth, pixel_class, np.linalg.inv(T_table_camera))
         context, grid = self._context(image, table)
         with contextlib.suppress(ParseError):  # a fixed number of objects is not found
             self._sample(frame_key(0, 0), context, grid)
@@ -121,7 +121,7 @@ class SceneParser:
             usable_share=usable,
         )
 
-    def _observe(self, frame: DepthFrame) -> tuple[Image, Table, Float[np.ndarray, "4 4"], float, list[str]]:
+    def _observe(self, frame: DepthFrame) -> tuple[ScoredImage, Table, Float[np.ndarray, "4 4"], float, list[str]]:
         """The image at scoring resolution, the table in it and T_camera_table, which share of the pixels on the table
         can be used, and notes."""
         settings = self.settings
@@ -133,9 +133,9 @@ class SceneParser:
             )
         points = unproject(np.where(returned, depth, np.nan), camera)
         T_camera_table, notes = self._find_table(frame, points[returned])
-        kind = workspace(points, T_camera_table, self._table_size, settings.workspace_height)
-        image, table = self._image(camera, np.where(returned, depth, 0.0), kind, T_camera_table)
-        usable = usable_share(kind, camera.rays(), T_camera_table, self._table_size, settings.far)
+        pixel_class = workspace(points, T_camera_table, self._table_size, settings.workspace_height)
+        image, table = self._image(camera, np.where(returned, depth, 0.0), pixel_class, T_camera_table)
+        usable = usable_share(pixel_class, camera.rays(), T_camera_table, self._table_size, settings.far)
         notes = [usable_note(usable)] * (usable < FEWEST_USABLE) + notes
         return image, table, T_camera_table, usable, notes
 
@@ -143,19 +143,21 @@ class SceneParser:
         self,
         camera: Intrinsics,
         depth: Float[np.ndarray, "height width"],
-        kind: Int[np.ndarray, "height width"],
+        pixel_class: Int[np.ndarray, "height width"],
         T_camera_table: Float[np.ndarray, "4 4"],
-    ) -> tuple[Image, Table]:
+    ) -> tuple[ScoredImage, Table]:
         """The image and the table in it for JAX, from depth in metres, 0 where there is no return."""
         settings = self.settings
-        bare = np.where(kind != BEYOND, table_depth(camera.rays(), T_camera_table, settings.far), np.inf)
+        bare = np.where(pixel_class != BEYOND, table_depth(camera.rays(), T_camera_table, settings.far), np.inf)
         likelihood, weight = Likelihood(settings.likelihood), np.float32(settings.pixel_weight)
         near, far, sigma_max = settings.near, settings.far, settings.sigma_max
-        image = scored_image(camera, depth, kind, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)
+        image = scored_image(
+            camera, depth, pixel_class, bare, near, far, sigma_max, likelihood=likelihood, weight=weight
+        )
         table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(self._table_size, jnp.float32))
         return jax.device_put(image), table
 
-    def _context(self, image: Image, table: Table) -> tuple[Context, NoiseGrid]:
+    def _context(self, image: ScoredImage, table: Table) -> tuple[Context, NoiseGrid]:
         return Context(image, self._arrays, table), noise_model.for_image(self._grid, image, self.settings.window)
 
     def _find_table(
@@ -205,14 +207,14 @@ class SceneParser:
             stages = stages[-1:]
         return stages, ess
 
-    def _empty(self, context: Context, grid: NoiseGrid) -> smc.State:
+    def _empty(self, context: Context, grid: NoiseGrid) -> smc.Population:
         settings = self.settings
         slots = max(settings.max_objects, 1)
         return smc.init(context, grid, settings.particles, slots, self._table_size, settings.window)
 
     def _refreshed(
-        self, key: PRNGKeyArray, state: smc.State, count: int, context: Context, grid: NoiseGrid
-    ) -> smc.State:
+        self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, grid: NoiseGrid
+    ) -> smc.Population:
         """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
         reheating."""
         settings = self.settings
@@ -227,7 +229,7 @@ class SceneParser:
         return state
 
     def _keep(
-        self, key: PRNGKeyArray, state: smc.State, context: Context, grid: NoiseGrid, matters: bool = True
+        self, key: PRNGKeyArray, state: smc.Population, context: Context, grid: NoiseGrid, matters: bool = True
     ) -> _Stage:
         """A stage's scenes; only its evidence where they do not matter."""
         if not matters:
@@ -235,7 +237,7 @@ class SceneParser:
             nobody = np.zeros((0, *none.x.shape[1:], 3), np.float32)
             zero = np.zeros(0, np.float32)
             return _Stage(none, nobody, np.zeros((0, 3), np.float32), zero, zero, zero, float(state.log_evidence))
-        noise = self._sample_noise(key, state.table, grid)
+        noise = self._sample_noise(key, state.loglik_grid, grid)
         error, window = self._smooth_error, self.settings.window
         offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
         height, tilt = jnp.float32(self.settings.table_height_sigma), jnp.float32(self.settings.table_tilt_sigma)
@@ -285,7 +287,7 @@ class SceneParser:
         )
         return samples, float(log_evidence)
 
-    def _poses(self, objects: Contact, table: Table, plane: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S M 4 4"]:
+    def _poses(self, objects: Placement, table: Table, plane: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S M 4 4"]:
         """T_camera_object in float64 numpy: sample counts differ from frame to frame, and must not recompile."""
         T_contact = np.asarray(self._arrays.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
         slide = np.zeros((*objects.type.shape, 4, 4))

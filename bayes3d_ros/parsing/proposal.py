@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
-from bayes3d_ros.objects.placement import Contact, Table
+from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.coarse_search import CELL
 
 _DEGREES_OF_FREEDOM = 4.0
@@ -22,7 +22,7 @@ SHARES, SHARES_WITHOUT_MODES = (0.84, 0.12, 0.04), (0.0, 0.7, 0.3)
 class Modes(NamedTuple):
     """Components m: a type and face, and a t distribution over (x, y, yaw)."""
 
-    centre: Contact  # [M]
+    centre: Placement  # [M]
     scale: Float[Array, "M 3 3"]  # lower Cholesky factor
     log_weight: Float[Array, "M"]  # normalised
 
@@ -38,7 +38,7 @@ def wrap(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
-def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Contact:
+def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Placement:
     """`count` objects from the modes alone; yaw in [0, 2 pi)."""
     keys = jax.random.split(key, 3)
     m = jax.random.categorical(keys[0], modes.log_weight, shape=(count,))
@@ -46,7 +46,7 @@ def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Contact:
     stretch = jnp.sqrt(_DEGREES_OF_FREEDOM / jax.random.chisquare(keys[2], _DEGREES_OF_FREEDOM, shape=(count,)))
     offset = jnp.einsum("nab,nb->na", modes.scale[m], gauss) * stretch[:, None]
     centre = modes.centre
-    return Contact(
+    return Placement(
         type=centre.type[m],
         face=centre.face[m],
         x=centre.x[m] + offset[:, 0],
@@ -55,27 +55,27 @@ def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Contact:
     )
 
 
-def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryArrays, table: Table) -> Contact:
+def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryArrays, table: Table) -> Placement:
     """`count` objects; yaw in [0, 2 pi)."""
     keys = jax.random.split(key, 8)
     mode = draw_modes(keys[0], proposal.modes, count)
-    kind = jax.random.randint(keys[1], (count,), 0, library.num_types)
+    type_id = jax.random.randint(keys[1], (count,), 0, library.num_types)
     face = jax.random.randint(keys[2], (count,), 0, NUM_FACES)
     yaw = jax.random.uniform(keys[3], (count,), maxval=2 * jnp.pi)
     cell = jax.random.categorical(keys[4], jnp.log(proposal.cells.ravel()), shape=(count,))
     corner = jnp.stack([cell // proposal.cells.shape[1], cell % proposal.cells.shape[1]], -1) * CELL - table.size / 2
     hidden = corner + CELL * jax.random.uniform(keys[5], (count, 2))
-    anywhere = (jax.random.uniform(keys[6], (count, 2)) - 0.5) * (table.size - library.face_size[kind, face])
+    anywhere = (jax.random.uniform(keys[6], (count, 2)) - 0.5) * (table.size - library.face_size[type_id, face])
     source = jax.random.choice(keys[7], 3, (count,), p=proposal.shares)
     floor = jnp.where((source == 1)[:, None], hidden, anywhere)
-    drawn = Contact(kind, face, floor[:, 0], floor[:, 1], yaw)
+    drawn = Placement(type_id, face, floor[:, 0], floor[:, 1], yaw)
     return jax.tree.map(lambda a, b: jnp.where(source == 0, a, b), mode, drawn)
 
 
-def log_density_modes(contact: Contact, modes: Modes) -> Float[Array, "N M"]:
+def log_density_modes(placement: Placement, modes: Modes) -> Float[Array, "N M"]:
     """log of weight times density of every component, per metre^2 and radian; -inf for another type or face."""
     nu = _DEGREES_OF_FREEDOM
-    same = (contact.type[:, None] == modes.centre.type) & (contact.face[:, None] == modes.centre.face)
+    same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
     L = modes.scale
     log_norm = (
         jax.scipy.special.gammaln((nu + 3) / 2)
@@ -85,28 +85,28 @@ def log_density_modes(contact: Contact, modes: Modes) -> Float[Array, "N M"]:
     )
     # A wide component reaches around the circle.
     terms = [
-        log_norm - (nu + 3) / 2 * jnp.log1p((whitened(contact, modes, turn) ** 2).sum(-1) / nu)
+        log_norm - (nu + 3) / 2 * jnp.log1p((whitened(placement, modes, turn) ** 2).sum(-1) / nu)
         for turn in (-2 * jnp.pi, 0.0, 2 * jnp.pi)
     ]
     return jnp.where(same, jax.nn.logsumexp(jnp.stack(terms), 0) + modes.log_weight, -jnp.inf)
 
 
-def whitened(contact: Contact, modes: Modes, turn: float = 0.0) -> Float[Array, "N M 3"]:
+def whitened(placement: Placement, modes: Modes, turn: float = 0.0) -> Float[Array, "N M 3"]:
     """Objects seen from every component, in units of its scale: L^-1 (x - centre), yaw wrapped and `turn` added."""
     L, centre = modes.scale, modes.centre
-    a = (contact.x[:, None] - centre.x) / L[:, 0, 0]
-    b = (contact.y[:, None] - centre.y - L[:, 1, 0] * a) / L[:, 1, 1]
-    yaw = wrap(contact.yaw[:, None] - centre.yaw) + turn
+    a = (placement.x[:, None] - centre.x) / L[:, 0, 0]
+    b = (placement.y[:, None] - centre.y - L[:, 1, 0] * a) / L[:, 1, 1]
+    yaw = wrap(placement.yaw[:, None] - centre.yaw) + turn
     return jnp.stack([a, b, (yaw - L[:, 2, 0] * a - L[:, 2, 1] * b) / L[:, 2, 2]], -1)
 
 
-def refit(contact: Contact, weight: Float[Array, "N"], modes: Modes) -> Modes:
+def refit(placement: Placement, weight: Float[Array, "N"], modes: Modes) -> Modes:
     """One step of population Monte Carlo (Cappe et al. 2008): weighted EM of the t mixture on draws from it. Components
     that hold too few draws keep their shape."""
     nu = _DEGREES_OF_FREEDOM
-    share = jax.nn.softmax(log_density_modes(contact, modes), 1) * weight[:, None]
+    share = jax.nn.softmax(log_density_modes(placement, modes), 1) * weight[:, None]
     held = share.sum(0)
-    z = whitened(contact, modes)
+    z = whitened(placement, modes)
     pull = share * (nu + 3) / (nu + (z**2).sum(-1))
     mean = jnp.einsum("nm,nma->ma", pull, z) / jnp.maximum(pull.sum(0), 1e-30)[:, None]
     centred = z - mean
@@ -122,18 +122,18 @@ def refit(contact: Contact, weight: Float[Array, "N"], modes: Modes) -> Modes:
     return Modes(centre, scale, jnp.log(0.97 * held / held.sum() + 0.03 / len(held)))
 
 
-def log_density(contact: Contact, proposal: Proposal, library: LibraryArrays, table: Table) -> Float[Array, "N"]:
+def log_density(placement: Placement, proposal: Proposal, library: LibraryArrays, table: Table) -> Float[Array, "N"]:
     """log q of proposed objects, per metre^2 and radian."""
-    at_mode = log_density_modes(contact, proposal.modes)
+    at_mode = log_density_modes(placement, proposal.modes)
     shape = jnp.array(proposal.cells.shape)
-    index = jnp.floor((jnp.stack([contact.x, contact.y], -1) + table.size / 2) / CELL).astype(jnp.int32)
+    index = jnp.floor((jnp.stack([placement.x, placement.y], -1) + table.size / 2) / CELL).astype(jnp.int32)
     inside = ((index >= 0) & (index < shape)).all(-1)
     index = jnp.clip(index, 0, shape - 1)
     log_share = jnp.log(proposal.shares)
     log_discrete = -jnp.log(library.num_types * NUM_FACES * 2 * jnp.pi)
     hidden = jnp.log(proposal.cells[index[:, 0], index[:, 1]]) - 2 * jnp.log(CELL)
-    free = table.size - library.face_size[contact.type, contact.face]
-    anywhere = (jnp.abs(jnp.stack([contact.x, contact.y], -1)) <= free / 2).all(-1)
+    free = table.size - library.face_size[placement.type, placement.face]
+    anywhere = (jnp.abs(jnp.stack([placement.x, placement.y], -1)) <= free / 2).all(-1)
     return jax.nn.logsumexp(
         jnp.stack(
             [

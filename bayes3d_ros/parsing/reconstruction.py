@@ -24,7 +24,7 @@ _walk = jax.jit(march)
 
 
 def draw_scene(
-    kinds: Sequence[int],
+    types: Sequence[int],
     T_camera_object: Sequence[Float[np.ndarray, "4 4"]],
     T_camera_table: Float[np.ndarray, "4 4"],
     camera: Intrinsics,
@@ -36,9 +36,9 @@ def draw_scene(
     rays = camera.rays()
     depth = table_depth(rays, T_camera_table, far).astype(np.float32)
     labels = np.zeros(depth.shape, np.uint16)
-    for label, (kind, T) in enumerate(zip(kinds, T_camera_object, strict=True), 1):
-        where = _covered(kind, T, camera, library)
-        drawn = _along(rays[where].reshape(-1, 3), kind, T, library).reshape(depth[where].shape)
+    for label, (type_id, T) in enumerate(zip(types, T_camera_object, strict=True), 1):
+        where = _covered(type_id, T, camera, library)
+        drawn = _along(rays[where].reshape(-1, 3), type_id, T, library).reshape(depth[where].shape)
         nearer = drawn < depth[where]
         depth[where] = np.where(nearer, drawn, depth[where])
         labels[where] = np.where(nearer, np.uint16(label), labels[where])
@@ -50,11 +50,13 @@ def compile_drawing(library: LibraryArrays) -> None:
     _along(np.ones((1, 3), np.float32), 0, np.eye(4), library)
 
 
-def _covered(kind: int, T: Float[np.ndarray, "4 4"], camera: Intrinsics, library: LibraryArrays) -> tuple[slice, slice]:
+def _covered(
+    type_id: int, T: Float[np.ndarray, "4 4"], camera: Intrinsics, library: LibraryArrays
+) -> tuple[slice, slice]:
     """Rows and columns of the pixels whose rays may meet the grid of an object."""
-    size = np.asarray(library.dims)[kind] * np.asarray(library.voxel_size)[kind]
+    size = np.asarray(library.dims)[type_id] * np.asarray(library.voxel_size)[type_id]
     unit = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    corners = (np.asarray(library.origin)[kind] + unit * size) @ T[:3, :3].T + T[:3, 3]
+    corners = (np.asarray(library.origin)[type_id] + unit * size) @ T[:3, :3].T + T[:3, 3]
     if (corners[:, 2] < BEHIND).any():  # about the camera, or behind it
         return slice(0, camera.height), slice(0, camera.width)
     focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
@@ -68,7 +70,7 @@ def _covered(kind: int, T: Float[np.ndarray, "4 4"], camera: Intrinsics, library
 
 
 def _along(
-    rays: Float[np.ndarray, "R 3"], kind: int, T: Float[np.ndarray, "4 4"], library: LibraryArrays
+    rays: Float[np.ndarray, "R 3"], type_id: int, T: Float[np.ndarray, "4 4"], library: LibraryArrays
 ) -> Float[np.ndarray, "R"]:
     """Depth of an object along rays (x, y, 1), inf where it is not met."""
     depth = np.full(len(rays), np.inf, np.float32)
@@ -77,5 +79,5 @@ def _along(
         some = rays[first : first + _AT_ONCE]
         x, y = np.zeros((2, _AT_ONCE), np.float32)
         x[: len(some)], y[: len(some)] = some[:, 0], some[:, 1]
-        depth[first : first + _AT_ONCE] = np.asarray(_walk(library, jnp.int32(kind), pose, (x, y)))[: len(some)]
+        depth[first : first + _AT_ONCE] = np.asarray(_walk(library, jnp.int32(type_id), pose, (x, y)))[: len(some)]
     return depth

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
-from bayes3d_ros.objects.placement import Contact, log_prior
-from bayes3d_ros.parsing.backward_kernel import Empty, gain_alone, log_order
+from bayes3d_ros.objects.placement import Placement, log_prior
+from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
 from bayes3d_ros.parsing.proposal import Proposal, log_density
 from bayes3d_ros.parsing.search import Context, conflicts
-from bayes3d_ros.parsing.tempering import move_new
+from bayes3d_ros.parsing.tempering import Proposed, move_new
 from bayes3d_ros.sampling.resampling import normalised, resample
 
 _COOLING = 0.7  # ratio of neighbouring exponents: about three quarters of the particles stay effective
@@ -28,14 +28,14 @@ _MOVES = 3  # at b = 1, when all is done: one of each kind
 _APART = 60.0  # nats between objects' own gains, beyond which a move does not change which came last
 
 
-class Scenes(NamedTuple):
+class WeightedScenes(NamedTuple):
     """N weighted scenes of `count` objects."""
 
-    objects: Contact  # [N, M]
-    alone: Float[Array, "N M"]  # nats that each object alone gains over the empty table
-    line: Int[Array, "N M"]  # which draw of its stage an object descends from; moves here do not change it
+    objects: Placement  # [N, M]
+    solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
+    lineage: Int[Array, "N M"]  # which draw of its stage an object descends from; moves here do not change it
     scenes: Float[Array, "N Hp Wp"]  # padded depth
-    table: Float[Array, "N S P"]
+    loglik_grid: Float[Array, "N S P"]
     log_likelihood: Float[Array, "N"]
     log_weight: Float[Array, "N"]  # normalised
 
@@ -56,37 +56,25 @@ class Effort(NamedTuple):
     heats: Int[Array, ""]  # steps down to the least exponent, 0.7^heats
 
 
-class _Placed(NamedTuple):
-    """One of the objects of every scene, and what depends on where it is; `ancestor` is the scene of the others."""
-
-    ancestor: Int[Array, "N"]
-    new: Contact  # [N]
-    alone: Float[Array, "N M"]
-    table: Float[Array, "N S P"]
-    log_likelihood: Float[Array, "N"]
-    log_q: Float[Array, "N"]
-    log_ratio: Float[Array, "N"]  # of the target to that of the others and q
-
-
-def distinct_fraction(contact: Contact, log_weight: Float[Array, "N"]) -> Float[Array, ""]:
+def distinct_fraction(placement: Placement, log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     """Effective fraction of the particles, copies of a placement counted as one."""
-    order = jnp.argsort(contact.x)
-    x, weight = contact.x[order], jax.nn.softmax(log_weight)[order]
+    order = jnp.argsort(placement.x)
+    x, weight = placement.x[order], jax.nn.softmax(log_weight)[order]
     group = jnp.cumsum(jnp.concatenate([jnp.zeros(1, jnp.int32), (x[1:] != x[:-1]).astype(jnp.int32)]))
     mass = jnp.zeros(len(x)).at[group].add(weight)
     return 1 / ((mass**2).sum() * len(x))
 
 
 def rejuvenate(
-    key: PRNGKeyArray, state: Scenes, proposals: Proposal, count: Int[Array, ""], frame: Frame, effort: Effort
-) -> Scenes:
+    key: PRNGKeyArray, state: WeightedScenes, proposals: Proposal, count: Int[Array, ""], frame: Frame, effort: Effort
+) -> WeightedScenes:
     """Move as many objects as there are turns: first that of which the fewest placements are left, then the others;
     proposals [M], of each slot's stage."""
     slots = state.objects.type.shape[1]
     left = jnp.stack([distinct_fraction(_slot(state.objects, m), state.log_weight) for m in range(slots)])
     first = jnp.argmin(jnp.where(jnp.arange(slots) < count, left, jnp.inf))
 
-    def turn(number: Array, state: Scenes) -> Scenes:
+    def turn(number: Array, state: WeightedScenes) -> WeightedScenes:
         m = (first + number) % jnp.maximum(count, 1)
         own = jax.tree.map(lambda a: a[m], proposals)
         return _move(jax.random.fold_in(key, number), state, m, own, count, frame, effort.heats)
@@ -94,23 +82,23 @@ def rejuvenate(
     return jax.lax.fori_loop(0, effort.turns, turn, state)
 
 
-def _slot(objects: Contact, m: Array | int) -> Contact:
+def _slot(objects: Placement, m: Array | int) -> Placement:
     return jax.tree.map(lambda a: a[:, m], objects)
 
 
 def _move(
     key: PRNGKeyArray,
-    state: Scenes,
+    state: WeightedScenes,
     m: Int[Array, ""],
     proposal: Proposal,
     count: Int[Array, ""],
     frame: Frame,
     heats: Int[Array, ""],
-) -> Scenes:
+) -> WeightedScenes:
     """The object in slot m of every scene."""
     context, grid, empty, window, overlap_limit, ess_threshold = frame
     image, library, table = context
-    particles, slots = state.alone.shape
+    particles, slots = state.solo_gain.shape
     others = jnp.arange(slots) != m
 
     def with_other(j: Array, scenes: Array) -> Array:
@@ -119,35 +107,35 @@ def _move(
 
     bare = jnp.broadcast_to(empty.scene, state.scenes.shape)
     without = jax.lax.fori_loop(0, count, with_other, bare)
-    gap = jnp.abs(state.alone - jnp.take_along_axis(state.alone, m[None, None], 1))
+    gap = jnp.abs(state.solo_gain - jnp.take_along_axis(state.solo_gain, m[None, None], 1))
     unclear = jnp.where(others & (jnp.arange(slots) < count), gap, jnp.inf).min() < _APART
     # Behind the last slot: not among those that an object may conflict with.
     rest = jax.tree.map(lambda a: a.at[:, m].set(a[:, count - 1]), state.objects)
 
-    def gain(ancestor: Int[Array, "N"], contact: Contact) -> Float[Array, "N S P"]:
-        return log_likelihood_gain(contact, ancestor, without, *context, grid.coarse, window)
+    def gain(ancestor: Int[Array, "N"], placement: Placement) -> Float[Array, "N S P"]:
+        return log_likelihood_gain(placement, ancestor, without, *context, grid.coarse, window)
 
     everyone, mine = jnp.arange(particles), _slot(state.objects, m)
-    table_without = state.table - gain(everyone, mine)
-    log_likelihood_without = log_marginal(table_without, grid)
+    grid_without = state.loglik_grid - gain(everyone, mine)
+    log_likelihood_without = log_marginal(grid_without, grid)
 
-    def with_terms(ancestor, contact, table_here, alone) -> _Placed:
-        log_likelihood = log_marginal(table_here, grid)
-        log_q = log_density(contact, proposal, library, table)
-        log_target = log_likelihood + log_prior(contact, library, table) + log_order(alone, count)
+    def with_terms(ancestor, placement, grid_here, solo_gain) -> Proposed:
+        log_likelihood = log_marginal(grid_here, grid)
+        log_q = log_density(placement, proposal, library, table)
+        log_target = log_likelihood + log_prior(placement, library, table) + log_order(solo_gain, count)
         log_ratio = log_target - log_likelihood_without[ancestor] - log_q
-        clash = conflicts(contact, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library, overlap_limit)
+        clash = conflicts(placement, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library, overlap_limit)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
-        return _Placed(ancestor, contact, alone, table_here, log_likelihood, log_q, log_ratio)
+        return Proposed(ancestor, placement, grid_here, log_likelihood, log_q, log_ratio, solo_gain=solo_gain)
 
-    def extend(ancestor: Int[Array, "N"], contact: Contact) -> _Placed:
+    def extend(ancestor: Int[Array, "N"], placement: Placement) -> Proposed:
         own = jax.lax.cond(
             unclear,
-            lambda: gain_alone(contact, empty, context, grid, window),
-            lambda: state.alone[ancestor, m],
+            lambda: solo_gain_of(placement, empty, context, grid, window),
+            lambda: state.solo_gain[ancestor, m],
         )
-        alone = state.alone[ancestor].at[:, m].set(own)
-        return with_terms(ancestor, contact, table_without[ancestor] + gain(ancestor, contact), alone)
+        solo_gain = state.solo_gain[ancestor].at[:, m].set(own)
+        return with_terms(ancestor, placement, grid_without[ancestor] + gain(ancestor, placement), solo_gain)
 
     def step(number: Array, carry: tuple) -> tuple:
         placed, log_weight, b = carry
@@ -158,8 +146,10 @@ def _move(
         placed, log_weight = resample(resample_key, placed, log_weight, ess_threshold)
         return move_new(move_key, placed, c, (number + 1) % 3, extend, proposal, library, table), log_weight, c
 
-    start = with_terms(everyone, mine, state.table, state.alone), state.log_weight, jnp.float32(1.0)
+    start = with_terms(everyone, mine, state.loglik_grid, state.solo_gain), state.log_weight, jnp.float32(1.0)
     end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, start)
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
     scenes = draw_objects(end.new, without[end.ancestor], *context, window)
-    return Scenes(objects, end.alone, state.line[end.ancestor], scenes, end.table, end.log_likelihood, log_weight)
+    return WeightedScenes(
+        objects, end.solo_gain, state.lineage[end.ancestor], scenes, end.loglik_grid, end.log_likelihood, log_weight
+    )

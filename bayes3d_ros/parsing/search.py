@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal, near_peak, peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene
-from bayes3d_ros.likelihood.scored_image import Image, halved
+from bayes3d_ros.likelihood.scored_image import ScoredImage, halved
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SKETCH_POINTS, LibraryArrays
-from bayes3d_ros.objects.placement import Contact, Table, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, Table, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     YAWS,
@@ -53,118 +53,118 @@ _BLUR = 0.002  # metres: candidates are scored at this sigma at least, or those 
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
-class Scene(NamedTuple):
+class LeadScene(NamedTuple):
     """A scene that stands for the population: its depth image, its log likelihood on the grid of noise, its objects."""
 
     depth: Float[Array, "Hp Wp"]  # padded
-    table: Float[Array, "S P"]
-    objects: Contact  # [M]
+    loglik_grid: Float[Array, "S P"]
+    objects: Placement  # [M]
     num_objects: Int[Array, ""]
 
 
 class Context(NamedTuple):
     """What a frame and a library fix for a whole parse."""
 
-    image: Image
+    image: ScoredImage
     library: LibraryArrays
     table: Table
 
 
-def evidence_left(scene_depth: Float[Array, "H W"], image: Image, noise: Noise) -> Evidence:
+def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: Noise) -> Evidence:
     """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
     explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
     an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
     many = noise.p_outlier[0] > MANY_OUTLIERS
-    depth, kind = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.kind)
+    depth, pixel_class = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
     if image.rows is not None:  # below the camera's last row the returns above it would agree on something
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth
     apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
     unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)
-    inside = kind == IN_WORKSPACE
+    inside = pixel_class == IN_WORKSPACE
     return Evidence(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
 
 
-def conflicts(contact: Contact, others: Contact, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
-    """Whether an object interpenetrates any of the first `count` others; contact [N], others [N, M]."""
+def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
+    """Whether an object interpenetrates any of the first `count` others; placement [N], others [N, M]."""
 
     def with_other(m: Int[Array, ""], worst: Float[Array, "N"]) -> Float[Array, "N"]:
-        share = overlap(contact, jax.tree.map(lambda a: a[:, m], others), library)
+        share = overlap(placement, jax.tree.map(lambda a: a[:, m], others), library)
         return jnp.maximum(worst, jnp.where(m < count, share, 0.0))
 
-    return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(contact.type.shape)) > limit
+    return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(placement.type.shape)) > limit
 
 
-def _distinct(contact: Contact, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
+def _distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
     """Scores, with those of near-copies of a better hypothesis set to -inf. Sorted by falling score beforehand."""
-    same = (contact.type[:, None] == contact.type) & (contact.face[:, None] == contact.face)
-    close = jnp.hypot(contact.x[:, None] - contact.x, contact.y[:, None] - contact.y) < near[0]
-    close &= jnp.abs(wrap(contact.yaw[:, None] - contact.yaw)) < near[1]
+    same = (placement.type[:, None] == placement.type) & (placement.face[:, None] == placement.face)
+    close = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y) < near[0]
+    close &= jnp.abs(wrap(placement.yaw[:, None] - placement.yaw)) < near[1]
     better = jnp.tril(same & close, -1)
     return jnp.where(better.any(1), -jnp.inf, score)
 
 
-def _apart(contact: Contact, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
+def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
     """Scores, with all but the `most` best of any place set behind the others, and those of a type there lowered by
     `_REPEATED` for each that is better: what is seen best must crowd out neither what stands elsewhere nor another type
     of a few percent. Sorted by falling score beforehand."""
-    apart = jnp.hypot(contact.x[:, None] - contact.x, contact.y[:, None] - contact.y)
-    close = apart < library.radius[contact.type]
+    apart = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y)
+    close = apart < library.radius[placement.type]
     before = jnp.tril(close & jnp.isfinite(score), -1)
-    same = before & (contact.type[:, None] == contact.type)
+    same = before & (placement.type[:, None] == placement.type)
     score = score - _REPEATED * same.sum(1)
     return jnp.where(before.sum(1) < most, score, score - _BEHIND)
 
 
 def candidates(
-    scene: Scene, evidence: Evidence, context: Context, shape: tuple[int, int], overlap_limit: float
+    scene: LeadScene, evidence: Evidence, context: Context, shape: tuple[int, int], overlap_limit: float
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
     """The coarse levels: scored cells, the best of them aligned, near-copies and impossible ones dropped."""
     image, library, table = context
     centres, count = cells_to_search(evidence, image, table, shape)
     scores = score_cells(centres, count, evidence, image, library, table)
-    kinds = scores.shape[1]
+    types = scores.shape[1]
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
     # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
     # another.
     _, index = jax.lax.top_k(scores.max(-1).ravel(), _GLOBAL)
     half = YAWS // _HALVES
-    per_face = scores.reshape(-1, kinds, NUM_FACES, _HALVES, half).transpose(1, 2, 3, 0, 4)
-    per_face = per_face.reshape(kinds * NUM_FACES * _HALVES, -1)
-    cell, kind, face = index // (kinds * NUM_FACES), index // NUM_FACES % kinds, index % NUM_FACES
-    quarter = jnp.argmax(scores[cell, kind, face].reshape(_GLOBAL, _QUARTERS, -1), -1)
+    per_face = scores.reshape(-1, types, NUM_FACES, _HALVES, half).transpose(1, 2, 3, 0, 4)
+    per_face = per_face.reshape(types * NUM_FACES * _HALVES, -1)
+    cell, type_id, face = index // (types * NUM_FACES), index // NUM_FACES % types, index % NUM_FACES
+    quarter = jnp.argmax(scores[cell, type_id, face].reshape(_GLOBAL, _QUARTERS, -1), -1)
     quarter = quarter + jnp.arange(_QUARTERS) * (YAWS // _QUARTERS)
     first = jnp.argmax(per_face, 1)
-    each_kind, each_face, each_half = (a.ravel() for a in jnp.indices((kinds, NUM_FACES, _HALVES)))
+    each_type, each_face, each_half = (a.ravel() for a in jnp.indices((types, NUM_FACES, _HALVES)))
     yaw = jnp.concatenate([quarter.ravel(), each_half * half + first % half])
     cell = jnp.concatenate([jnp.repeat(cell, _QUARTERS), first // half])
-    kind = jnp.concatenate([jnp.repeat(kind, _QUARTERS), each_kind])
+    type_id = jnp.concatenate([jnp.repeat(type_id, _QUARTERS), each_type])
     face = jnp.concatenate([jnp.repeat(face, _QUARTERS), each_face])
-    coarse = scores[cell, kind, face, yaw]
-    contact = Contact(kind, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
-    contact, information = align(contact, evidence, image, library, table)
+    coarse = scores[cell, type_id, face, yaw]
+    placement = Placement(type_id, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
+    placement, information = align(placement, evidence, image, library, table)
     loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
-    found = Hypotheses(contact, factor(jnp.linalg.inv(information / _ALIGNED**2 + loose)))
-    score = sketch_score(contact, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
-    score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(contact, library, table)), score, -jnp.inf)
+    found = Hypotheses(placement, factor(jnp.linalg.inv(information / _ALIGNED**2 + loose)))
+    score = sketch_score(placement, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
+    score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
-    clash = conflicts(contact, others, scene.num_objects, library, overlap_limit)
+    clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    return best_first(found, _distinct(found.contact, score, (0.008, 0.1)), _CANDIDATES)
+    return best_first(found, _distinct(found.placement, score, (0.008, 0.1)), _CANDIDATES)
 
 
 def _gains(
-    contact: Contact, depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int
+    placement: Placement, depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int
 ) -> Float[Array, "N"]:
     """Log likelihood gained over one scene at one noise level; -inf outside the prior."""
-    ancestor = jnp.zeros(contact.type.shape, jnp.int32)
-    gain = log_likelihood_gain(contact, ancestor, depth[None], *context, noise, window)[:, 0, 0]
-    return jnp.where(jnp.isfinite(log_prior(contact, context.library, context.table)), gain, -jnp.inf)
+    ancestor = jnp.zeros(placement.type.shape, jnp.int32)
+    gain = log_likelihood_gain(placement, ancestor, depth[None], *context, noise, window)[:, 0, 0]
+    return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), gain, -jnp.inf)
 
 
 def find_proposal(
     key: PRNGKeyArray,
-    scene: Scene,
+    scene: LeadScene,
     context: Context,
     grid: NoiseGrid,
     table_size: tuple[float, float],
@@ -174,7 +174,7 @@ def find_proposal(
     """The proposal for one more object, given the scene that stands for the population, and the exponents by which to
     go from it to the target."""
     image, library, table = context
-    noise = peak(scene.table, grid)
+    noise = peak(scene.loglik_grid, grid)
     height, width = image.depth.shape
     half = window // 2
     shape = cell_grid(table_size)
@@ -188,39 +188,39 @@ def find_proposal(
 
     blurred = noise._replace(sigma=jnp.maximum(noise.sigma, _BLUR))
 
-    def rough(contact: Contact) -> Float[Array, "N"]:
-        return fewer**2 * _gains(contact, small_depth, small, blurred, window)
+    def rough(placement: Placement) -> Float[Array, "N"]:
+        return fewer**2 * _gains(placement, small_depth, small, blurred, window)
 
-    def table_with(contact: Contact) -> Float[Array, "S P"]:
+    def grid_with(placement: Placement) -> Float[Array, "S P"]:
         """The scene's once the first of these objects explains what it does."""
-        first = take(contact, slice(1))
+        first = take(placement, slice(1))
         gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
-        return scene.table + gain[0]
+        return scene.loglik_grid + gain[0]
 
-    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.contact), -jnp.inf), _CANDIDATES)
+    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), _CANDIDATES)
     worth = gain[0] > _WORTH
-    gain = _apart(found.contact, _distinct(found.contact, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
+    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
     found, _ = best_first(found, gain, _MODES)
 
     def search() -> tuple[Modes, Pilots]:
         narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
         modes, value = narrow(narrow_key, found, rough)
         modes, value = best_first(modes, value, _MODES)
-        value = _apart(modes.contact, _distinct(modes.contact, value, (0.006, 0.15)), library, FINALISTS - 1)
+        value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, FINALISTS - 1)
         modes, _ = best_first(modes, value, FINALISTS)
-        table_then = table_with(modes.contact)
-        noise, near = peak(table_then, grid), near_peak(table_then, grid)
+        grid_then = grid_with(modes.placement)
+        noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
         rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
 
-        def exact(contact: Contact) -> Float[Array, "N"]:
-            return _gains(contact, scene.depth, context, noise, window)
+        def exact(placement: Placement) -> Float[Array, "N"]:
+            return _gains(placement, scene.depth, context, noise, window)
 
-        def marginal(contact: Contact) -> Float[Array, "N"]:
+        def marginal(placement: Placement) -> Float[Array, "N"]:
             """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of
             the image are compared by thousands of nats; at one noise level that comparison is off by ten."""
-            ancestor = jnp.zeros(contact.type.shape, jnp.int32)
-            gain = log_likelihood_gain(contact, ancestor, scene.depth[None], *context, near.coarse, window)
-            return log_marginal(scene.table[rows] + gain, near)
+            ancestor = jnp.zeros(placement.type.shape, jnp.int32)
+            gain = log_likelihood_gain(placement, ancestor, scene.depth[None], *context, near.coarse, window)
+            return log_marginal(scene.loglik_grid[rows] + gain, near)
 
         modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
         mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
@@ -228,14 +228,14 @@ def find_proposal(
 
     def nothing() -> tuple[Modes, Pilots]:
         modes = as_mixture(take(found, slice(FINALISTS)), jnp.zeros(FINALISTS))
-        mixture = with_lookalikes(modes, lambda contact: jnp.zeros(contact.type.shape), library)
-        nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.contact)
+        mixture = with_lookalikes(modes, lambda placement: jnp.zeros(placement.type.shape), library)
+        nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.placement)
         return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))
 
     mixture, pilots = jax.lax.cond(worth, search, nothing)
     cells = hidden_cells(image, table, shape)
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
     proposal = Proposal(mixture, cells / cells.sum(), shares)
-    log_q = log_density(pilots.contact, proposal, library, table)
+    log_q = log_density(pilots.placement, proposal, library, table)
     path = exponents(pilots.log_target - log_q, log_q - pilots.log_drawn)
     return proposal, jnp.where(worth, path, jnp.ones(LEVELS))

@@ -7,7 +7,7 @@ came last: the one that explains least alone, since the search adds what explain
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,28 +16,28 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.noise import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
-from bayes3d_ros.objects.placement import Contact, log_prior
-from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, gain_alone, log_last
+from bayes3d_ros.objects.placement import Placement, log_prior
+from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.proposal import SHARES, Modes, Proposal, log_density, propose
-from bayes3d_ros.parsing.rejuvenation import Effort, Frame, Scenes, rejuvenate
-from bayes3d_ros.parsing.search import Context, Scene, conflicts, find_proposal
-from bayes3d_ros.parsing.tempering import MOST_LEVELS, TOO_UNEVEN, Extended, longest_step, move_new
+from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
+from bayes3d_ros.parsing.search import Context, LeadScene, conflicts, find_proposal
+from bayes3d_ros.parsing.tempering import MOST_LEVELS, TOO_UNEVEN, Proposed, longest_step, move_new
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
 _MOVES = 2  # once resampled at the target; on the way there one
 
 
-class State(NamedTuple):
+class Population(NamedTuple):
     """N weighted scenes of k objects."""
 
-    objects: Contact  # [N, M]
-    alone: Float[Array, "N M"]  # nats that each object alone gains over the empty table
-    line: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
+    objects: Placement  # [N, M]
+    solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
+    lineage: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
     scenes: Float[Array, "N Hp Wp"]  # padded depth
-    table: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
+    loglik_grid: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
     log_likelihood: Float[Array, "N"]  # noise integrated out
     log_weight: Float[Array, "N"]  # normalised
     log_evidence: Float[Array, ""]  # of k objects, relative to the empty table
@@ -45,7 +45,7 @@ class State(NamedTuple):
     empty: Empty  # the table without any
 
 
-class Info(NamedTuple):
+class StageInfo(NamedTuple):
     """What happened in a stage."""
 
     ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
@@ -54,7 +54,7 @@ class Info(NamedTuple):
 @partial(jax.jit, static_argnames=("particles", "max_objects", "table_size", "window"))
 def init(
     context: Context, grid: NoiseGrid, particles: int, max_objects: int, table_size: tuple[float, float], window: int
-) -> State:
+) -> Population:
     """The empty table."""
     empty = empty_table(context, grid, window)
     slots = (particles, max_objects)
@@ -64,18 +64,18 @@ def init(
     def everywhere(a: Array) -> Array:
         return jnp.broadcast_to(a, (particles, *a.shape[1:]))
 
-    return State(
-        objects=Contact(none, none, zero, zero, zero),
-        alone=zero,
-        line=none,
+    return Population(
+        objects=Placement(none, none, zero, zero, zero),
+        solo_gain=zero,
+        lineage=none,
         scenes=everywhere(empty.scene),
-        table=everywhere(empty.table),
+        loglik_grid=everywhere(empty.loglik_grid),
         log_likelihood=everywhere(empty.log_likelihood),
         log_weight=jnp.full(particles, -jnp.log(particles), jnp.float32),
         log_evidence=jnp.float32(0.0),
         proposals=Proposal(
             Modes(
-                Contact(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
+                Placement(none_yet, none_yet, *jnp.zeros((3, max_objects, COMPONENTS))),
                 jnp.broadcast_to(jnp.eye(3), (max_objects, COMPONENTS, 3, 3)),
                 jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
             ),
@@ -89,14 +89,14 @@ def init(
 @partial(jax.jit, static_argnames=("table_size", "window", "ess_threshold"))
 def step(
     key: PRNGKeyArray,
-    state: State,
+    state: Population,
     count: Int[Array, ""],
     context: Context,
     grid: NoiseGrid,
     table_size: tuple[float, float],
     window: int,
     ess_threshold: float,
-) -> tuple[State, Info]:
+) -> tuple[Population, StageInfo]:
     """Add an object to scenes that hold `count` of them."""
     image, library, table = context
     particles = state.log_weight.shape[0]
@@ -104,19 +104,21 @@ def step(
     ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
-    scene = Scene(state.scenes[lead], state.table[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
+    scene = LeadScene(
+        state.scenes[lead], state.loglik_grid[lead], jax.tree.map(lambda a: a[lead], state.objects), count
+    )
     proposal, exponents = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
 
-    def extend(ancestor: Int[Array, "N"], new: Contact) -> Extended:
+    def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
         gain = log_likelihood_gain(new, ancestor, state.scenes, *context, grid.coarse, window)
-        summed = state.table[ancestor] + gain
+        summed = state.loglik_grid[ancestor] + gain
         log_likelihood = noise_model.log_marginal(summed, grid)
         log_q = log_density(new, proposal, library, table)
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
-        return Extended(ancestor, new, summed, log_likelihood, log_q, log_ratio, jnp.arange(particles))
+        return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, lineage=jnp.arange(particles))
 
     start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
     end, log_weight, log_evidence, ess = _anneal(
@@ -125,42 +127,42 @@ def step(
     own = jax.lax.cond(
         count == 0,
         lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
-        lambda: gain_alone(end.new, state.empty, context, grid, window),
+        lambda: solo_gain_of(end.new, state.empty, context, grid, window),
     )
-    alone = state.alone[end.ancestor].at[:, count].set(own)
-    log_weight, last = normalised(log_weight + log_last(alone, count))
+    solo_gain = state.solo_gain[end.ancestor].at[:, count].set(own)
+    log_weight, last = normalised(log_weight + log_last(solo_gain, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
-    line = state.line[end.ancestor].at[:, count].set(end.line)
+    lineage = state.lineage[end.ancestor].at[:, count].set(end.lineage)
     scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
     proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
-    return State(
+    return Population(
         objects=objects,
-        alone=alone,
-        line=line,
+        solo_gain=solo_gain,
+        lineage=lineage,
         scenes=scenes,
-        table=end.table,
+        loglik_grid=end.loglik_grid,
         log_likelihood=end.log_likelihood,
         log_weight=log_weight,
         log_evidence=state.log_evidence + log_evidence + last,
         proposals=proposals,
         empty=state.empty,
-    ), Info(ess)
+    ), StageInfo(ess)
 
 
 @partial(jax.jit, static_argnames=("window", "ess_threshold"))
 def refresh(
     key: PRNGKeyArray,
-    state: State,
+    state: Population,
     count: Int[Array, ""],
     context: Context,
     grid: NoiseGrid,
     window: int,
     ess_threshold: float,
     effort: Effort,
-) -> State:
+) -> Population:
     """The same posterior of scenes of `count` objects, some of them moved."""
-    scenes = Scenes(*(getattr(state, name) for name in Scenes._fields))
+    scenes = WeightedScenes(*(getattr(state, name) for name in WeightedScenes._fields))
     frame = Frame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
@@ -183,11 +185,12 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
         level_key = jax.random.fold_in(key, level)
         extended, log_weight = resample(jax.random.fold_in(level_key, _MOVES), extended, log_weight, ess_threshold)
 
-        def move(number: Array, extended: Extended) -> Extended:
-            move_key, kind = jax.random.fold_in(level_key, number), (level + number) % 3
-            moved = move_new(move_key, extended, c, kind, extend, proposal, context.library, context.table)
-            fresh = (kind == 2) & (moved.new.x != extended.new.x)
-            return moved._replace(line=jnp.where(fresh, moved.line + (level + 1) * len(fresh), extended.line))
+        def move(number: Array, extended: Proposed) -> Proposed:
+            move_key, choice = jax.random.fold_in(level_key, number), (level + number) % 3
+            moved = move_new(move_key, extended, c, choice, extend, proposal, context.library, context.table)
+            fresh = (choice == 2) & (moved.new.x != extended.new.x)
+            begun = cast(Array, moved.lineage) + (level + 1) * len(fresh)
+            return moved._replace(lineage=jnp.where(fresh, begun, cast(Array, extended.lineage)))
 
         moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
         extended = jax.lax.fori_loop(0, moves, move, extended)

@@ -10,7 +10,7 @@ order, a slide and a turn on the table, the least-squares fit of the moved surfa
 
 with J the visible surface's motion along its normal for a unit of x, y and yaw, and c the cosine at which it is seen.
 Outlines hold an object too (R), and are themselves known to a fraction of a pixel. The likelihood is of the picture
-(the contact that the sampler finds); the object's own contact is the picture's plus an offset with that Gaussian's
+(the placement that the sampler finds); the object's own placement is the picture's plus an offset with that Gaussian's
 covariance. So the field is integrated out where it matters and no evidence changes. With both amplitudes zero the
 model is that of independent pixels.
 """
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import NO_RETURN
-from bayes3d_ros.objects.placement import Contact, T_camera_object
+from bayes3d_ros.objects.placement import Placement, T_camera_object
 from bayes3d_ros.parsing.search import Context
 
 _POINTS = 48  # of an object's sketch
@@ -42,15 +42,15 @@ class SmoothError(NamedTuple):
 
 
 def offset_covariance(
-    objects: Contact, scenes: Float[Array, "N Hp Wp"], context: Context, error: SmoothError, window: int
+    objects: Placement, scenes: Float[Array, "N Hp Wp"], context: Context, error: SmoothError, window: int
 ) -> Float[Array, "N M 3 3"]:
-    """Covariance of (x, y, yaw) between each object and its picture; objects [N, M], scenes as in `smc.State`."""
+    """Covariance of (x, y, yaw) between each object and its picture; objects [N, M], scenes as in `smc.Population`."""
     image, library, table = context
     height, width = image.depth.shape
     half = window // 2
-    kind, face = jnp.maximum(objects.type, 0), jnp.maximum(objects.face, 0)
-    T = T_camera_object(objects._replace(type=kind, face=face), library, table)[..., None, :, :]
-    points, normals = library.sketch[kind][..., :_POINTS, :], library.sketch_normal[kind][..., :_POINTS, :]
+    type_id, face = jnp.maximum(objects.type, 0), jnp.maximum(objects.face, 0)
+    T = T_camera_object(objects._replace(type=type_id, face=face), library, table)[..., None, :, :]
+    points, normals = library.sketch[type_id][..., :_POINTS, :], library.sketch_normal[type_id][..., :_POINTS, :]
     p = (T[..., :3, :3] * points[..., None, :]).sum(-1) + T[..., :3, 3]
     n = (T[..., :3, :3] * normals[..., None, :]).sum(-1)
     z = jnp.maximum(p[..., 2], 0.02)
@@ -61,7 +61,7 @@ def offset_covariance(
     front = scenes[jnp.arange(len(scenes))[:, None, None], v + half, u + half]
     cosine = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
     facing = cosine > 0.1
-    seen = inside & facing & (p[..., 2] < front + _BEHIND) & (image.kind[v, u] != NO_RETURN)
+    seen = inside & facing & (p[..., 2] < front + _BEHIND) & (image.pixel_class[v, u] != NO_RETURN)
     R, origin = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     centre = objects.x[..., None] * R[:, 0] + objects.y[..., None] * R[:, 1] + origin
     turn = jnp.cross(R[:, 2], p - centre[..., None, :])
@@ -80,7 +80,7 @@ def offset_covariance(
 
 def draw_offsets(
     key: PRNGKeyArray,
-    objects: Contact,
+    objects: Placement,
     scenes: Float[Array, "N Hp Wp"],
     context: Context,
     error: SmoothError,

@@ -156,7 +156,7 @@ def table_depth(
 
 
 def usable_share(
-    kind: Int[np.ndarray, "H W"],
+    pixel_class: Int[np.ndarray, "H W"],
     rays: Float[np.ndarray, "H W 3"],
     T_camera_table: Float[np.ndarray, "4 4"],
     table_size: tuple[float, float],
@@ -169,7 +169,7 @@ def usable_share(
     met = np.isfinite(bare)
     local = (rays[met] * bare[met, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
     on_table = (np.abs(local) < np.array(table_size) / 2).all(-1)
-    return float((kind[met][on_table] != NO_RETURN).mean()) if on_table.any() else float("nan")
+    return float((pixel_class[met][on_table] != NO_RETURN).mean()) if on_table.any() else float("nan")
 
 
 def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:

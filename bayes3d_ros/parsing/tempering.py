@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import LibraryArrays
-from bayes3d_ros.objects.placement import Contact, Table, shifted
+from bayes3d_ros.objects.placement import Placement, Table, shifted
 from bayes3d_ros.parsing.proposal import Modes, Proposal, propose
 from bayes3d_ros.sampling.resampling import effective_fraction
 
@@ -60,56 +60,57 @@ def longest_step(
     return jnp.where(enough(most), most, c)
 
 
-def walk(key: PRNGKeyArray, contact: Contact, modes: Modes) -> Contact:
+def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
     """A symmetric random walk in (x, y, yaw), as wide as one of the components of the same type and face, whichever."""
     choice, noise, size = jax.random.split(key, 3)
-    count = contact.type.shape[0]
-    same = (contact.type[:, None] == modes.centre.type) & (contact.face[:, None] == modes.centre.face)
+    count = placement.type.shape[0]
+    same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
     m = jax.random.categorical(choice, jnp.where(same, modes.log_weight, -jnp.inf))
     scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(_LOOSE)))
     low, high = jnp.log(jnp.array(_STEPS))
     length = jnp.exp(low + (high - low) * jax.random.uniform(size, (count, 1)))
     step = length * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
-    yaw = jnp.mod(contact.yaw + step[:, 2], 2 * jnp.pi)
-    return contact._replace(x=contact.x + step[:, 0], y=contact.y + step[:, 1], yaw=yaw)
+    yaw = jnp.mod(placement.yaw + step[:, 2], 2 * jnp.pi)
+    return placement._replace(x=placement.x + step[:, 0], y=placement.y + step[:, 1], yaw=yaw)
 
 
-def jump(key: PRNGKeyArray, contact: Contact, library: LibraryArrays) -> Contact:
+def jump(key: PRNGKeyArray, placement: Placement, library: LibraryArrays) -> Placement:
     """To one of the poses in which the object looks alike, whichever. Each has a way back: this is symmetric."""
     ways = library.alike_face.shape[2]
-    way = jax.random.randint(key, contact.type.shape, 0, ways)
-    kind, face = jnp.maximum(contact.type, 0), jnp.maximum(contact.face, 0)
-    there = shifted(contact, library.alike_face[kind, face, way], library.alike_shift[kind, face, way])
+    way = jax.random.randint(key, placement.type.shape, 0, ways)
+    type_id, face = jnp.maximum(placement.type, 0), jnp.maximum(placement.face, 0)
+    there = shifted(placement, library.alike_face[type_id, face, way], library.alike_shift[type_id, face, way])
     return there._replace(yaw=jnp.mod(there.yaw, 2 * jnp.pi))
 
 
-class Extended(NamedTuple):
-    """N scenes, each an ancestor with one more object."""
+class Proposed(NamedTuple):
+    """N scenes of which one object is proposed and may move; `ancestor` is the scene of the others."""
 
     ancestor: Int[Array, "N"]
-    new: Contact  # [N]
-    table: Float[Array, "N S P"]
-    log_likelihood: Float[Array, "N"]
+    new: Placement  # [N]
+    loglik_grid: Float[Array, "N S P"]
+    log_likelihood: Float[Array, "N"]  # noise integrated out
     log_q: Float[Array, "N"]  # of the new object
-    log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q; what came last not yet told
-    line: Int[Array, "N"]  # which draw from q the new object descends from, by copies and small moves
+    log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q
+    lineage: Int[Array, "N"] | None = None  # which draw from q the new object descends from, by copies and small moves
+    solo_gain: Float[Array, "N M"] | None = None  # nats that each object alone gains over the empty table
 
 
 def move_new(
     key: PRNGKeyArray,
     at: Tree,
     b: Float[Array, ""],
-    kind: Int[Array, ""],
-    extend: Callable[[Int[Array, "N"], Contact], Tree],
+    move: Int[Array, ""],
+    extend: Callable[[Int[Array, "N"], Placement], Tree],
     proposal: Proposal,
     library: LibraryArrays,
     table: Table,
 ) -> Tree:
-    """Metropolis-Hastings of the new object under q^(1-b) target^b; at holds what `Extended` does. `kind`: 0 a jump to
+    """Metropolis-Hastings of the new object under q^(1-b) target^b; at holds what `Proposed` does. `move`: 0 a jump to
     where it looks alike, 1 a walk, 2 a fresh draw from q."""
     draw_key, accept_key = jax.random.split(key)
     new = jax.lax.switch(
-        kind,
+        move,
         (
             lambda: jump(draw_key, at.new, library),
             lambda: walk(draw_key, at.new, proposal.modes),
@@ -117,6 +118,6 @@ def move_new(
         ),
     )
     to = extend(at.ancestor, new)
-    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(kind == 2, 0.0, to.log_q - at.log_q)
+    log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(move == 2, 0.0, to.log_q - at.log_q)
     accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
     return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)

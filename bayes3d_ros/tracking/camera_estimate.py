@@ -20,7 +20,7 @@ class KnownWorld:
 
     types: tuple[str, ...]
     T_world_object: Float[np.ndarray, "K 4 4"]
-    table: bool  # whether the plane z = 0 is a surface
+    table_visible: bool  # whether the plane z = 0 is a surface
 
 
 @dataclass(frozen=True)

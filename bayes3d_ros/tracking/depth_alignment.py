@@ -10,14 +10,14 @@ from jaxtyping import Array, Bool, Float
 
 from bayes3d_ros.likelihood.camera_score import World, render_cameras
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 _DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians
 RENDERED = 1 + 2 * len(_DELTA)  # images that a step looks at
 
 
-class Scene(NamedTuple):
+class TrackedScene(NamedTuple):
     """What is fixed while a camera is tracked."""
 
     world: World
@@ -32,8 +32,8 @@ class Scene(NamedTuple):
 def aligned(
     pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]],
     start: Float[Array, "6"],
-    image: Image,
-    scene: Scene,
+    image: ScoredImage,
+    scene: TrackedScene,
     scale: Float[Array, "6"],
     reaches: Float[Array, "K"],
 ) -> Float[Array, "6"]:
@@ -57,13 +57,16 @@ def information(slope: Float[Array, "6 H W"], weight: Float[Array, "H W"]) -> Fl
 
 
 def rendered_slopes(
-    pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]], at: Float[Array, "6"], image: Image, scene: Scene
+    pose: Callable[[Float[Array, "D 6"]], Float[Array, "D 4 4"]],
+    at: Float[Array, "6"],
+    image: ScoredImage,
+    scene: TrackedScene,
 ) -> tuple[Float[Array, "H W"], Float[Array, "6 H W"], Bool[Array, "H W"]]:
     """Rendered depth at a tangent that `pose` makes a camera pose of, its slopes along the tangent, and where there
     are both and a return; zero elsewhere."""
     delta = jnp.array(_DELTA)
     around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
     depth = render_cameras(pose(at + around), scene.world, image, scene.library)
-    seen = (image.kind == IN_WORKSPACE) & jnp.isfinite(depth).all(0)
+    seen = (image.pixel_class == IN_WORKSPACE) & jnp.isfinite(depth).all(0)
     depth = jnp.where(seen, depth, 0.0)
     return depth[0], (depth[1:7] - depth[7:]) / (2 * delta[:, None, None]), seen

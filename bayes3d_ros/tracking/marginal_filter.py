@@ -27,10 +27,10 @@ from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.camera_score import log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.noise import NoiseGrid
-from bayes3d_ros.likelihood.scored_image import Image, at_most
+from bayes3d_ros.likelihood.scored_image import ScoredImage, at_most
 from bayes3d_ros.likelihood.sharding import over_devices
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, systematic
-from bayes3d_ros.tracking.depth_alignment import RENDERED, Scene, aligned, information, rendered_slopes
+from bayes3d_ros.tracking.depth_alignment import RENDERED, TrackedScene, aligned, information, rendered_slopes
 
 _FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
 _BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by round: before alignment, and after
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
     turn: Float[Array, ""] | np.floating  # radians
 
 
-class State(NamedTuple):
+class FilterState(NamedTuple):
     """N weighted particles."""
 
     T_camera_world: Float[Array, "N 4 4"]
@@ -65,7 +65,7 @@ class State(NamedTuple):
     p_outlier: Float[Array, ""]
 
 
-class Info(NamedTuple):
+class FilterInfo(NamedTuple):
     """What a frame said."""
 
     T_camera_world: Float[Array, "4 4"]  # the mean
@@ -77,10 +77,10 @@ class Info(NamedTuple):
     p_outlier: Float[Array, ""]
 
 
-def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_outlier: float = 0.05) -> State:
+def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_outlier: float = 0.05) -> FilterState:
     """A camera whose pose is given, at rest."""
     every = jnp.broadcast_to(jnp.asarray(T_camera_world, jnp.float32), (particles, 4, 4))
-    return State(
+    return FilterState(
         every,
         jnp.broadcast_to(jnp.eye(4), (particles, 4, 4)),
         jnp.full(particles, -jnp.log(particles), jnp.float32),
@@ -90,7 +90,7 @@ def start(T_camera_world: Float[Array, "4 4"], particles: int, sigma: float, p_o
 
 
 @jax.jit
-def expected_pose(state: State) -> Float[Array, "4 4"]:
+def expected_pose(state: FilterState) -> Float[Array, "4 4"]:
     """Where the velocity of the likeliest particle leads to: T_camera_world."""
     best = jnp.argmax(state.log_weight)
     return product(state.motion[best], state.T_camera_world[best])
@@ -172,15 +172,15 @@ def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D
 @partial(jax.jit, static_argnames=("hypotheses", "window", "devices"))
 def step(
     key: PRNGKeyArray,
-    state: State,
-    image: Image,
-    scene: Scene,
+    state: FilterState,
+    image: ScoredImage,
+    scene: TrackedScene,
     grid: NoiseGrid,
     motion: Motion,
     hypotheses: int,
     window: int,
     devices: tuple[jax.Device, ...] = (),
-) -> tuple[State, Info]:
+) -> tuple[FilterState, FilterInfo]:
     """The posterior one frame later, with `hypotheses` images scored or rendered in all; of the state's particles there
     have to be as many as `shares` says. The work is shared out over `devices`; with several of them `state` has to be
     on all (`on_all`)."""
@@ -208,16 +208,16 @@ def step(
     )
     # Noise about the best for the pose that the search ended at: no draw has a say in it, and the rest has no mass.
     near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, _NOISE_LEVELS)
-    table = score(T, near.coarse)
-    log_likelihood = noise_model.log_marginal(table, near)
+    loglik_grid = score(T, near.coarse)
+    log_likelihood = noise_model.log_marginal(loglik_grid, near)
     log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
     ancestor = jax.random.categorical(ancestor_key, by_ancestor)
     T = rigid(T)
     moved = rigid(product(T, inverse(before[ancestor])))
-    noise = noise_model.peak(table[jnp.argmax(log_weight)], near)
-    new = State(T, moved, log_weight, noise.sigma[0], noise.p_outlier[0])
+    noise = noise_model.peak(loglik_grid[jnp.argmax(log_weight)], near)
+    new = FilterState(T, moved, log_weight, noise.sigma[0], noise.p_outlier[0])
     mean, covariance = _moments(chart, T, log_weight)
-    return new, Info(
+    return new, FilterInfo(
         mean,
         covariance,
         _FREEDOM / (_FREEDOM - 2) * product(chart.scale, chart.scale.T),
@@ -241,10 +241,10 @@ def shares(hypotheses: int) -> tuple[int, int]:
 
 def _search(
     key: PRNGKeyArray,
-    state: State,
+    state: FilterState,
     expected: Float[Array, "K 4 4"],
-    image: Image,
-    scene: Scene,
+    image: ScoredImage,
+    scene: TrackedScene,
     motion: Motion,
     hypotheses: int,
     score: Callable[[Float[Array, "D 4 4"], Noise], Float[Array, "D S P"]],
@@ -275,7 +275,12 @@ def _search(
 
 
 def _all_aligned(
-    starts: Float[Array, "S 6"], chart: _Chart, image: Image, scene: Scene, scale: Float[Array, "6"], sigma: Array
+    starts: Float[Array, "S 6"],
+    chart: _Chart,
+    image: ScoredImage,
+    scene: TrackedScene,
+    scale: Float[Array, "6"],
+    sigma: Array,
 ) -> tuple[Float[Array, "S 6"], Float[Array, "S 6 6"]]:
     return jax.lax.map(lambda start: _aligned(chart, start, image, scene, scale, sigma), starts)
 
@@ -283,8 +288,8 @@ def _all_aligned(
 def _aligned(
     chart: _Chart,
     start: Float[Array, "6"],
-    image: Image,
-    scene: Scene,
+    image: ScoredImage,
+    scene: TrackedScene,
     scale: Float[Array, "6"],
     sigma: Float[Array, ""],
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:

@@ -21,10 +21,10 @@ from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.geometry.se3 import exp_about, product
 from bayes3d_ros.likelihood.camera_score import log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.scored_image import Image, at_most
+from bayes3d_ros.likelihood.scored_image import ScoredImage, at_most
 from bayes3d_ros.likelihood.sharding import over_devices
 from bayes3d_ros.parsing.support_plane import find_plane, table_frame
-from bayes3d_ros.tracking.depth_alignment import Scene, aligned
+from bayes3d_ros.tracking.depth_alignment import TrackedScene, aligned
 
 _DRAWS = 8192
 _ALIGNED = 96  # of them
@@ -83,8 +83,8 @@ def over_table(
 
 def find_camera(
     prior: LookAt,
-    scene: Scene,
-    image: Image,
+    scene: TrackedScene,
+    image: ScoredImage,
     points: Float[np.ndarray, "P 3"],
     window: int,
     rng: np.random.Generator,
@@ -94,7 +94,7 @@ def find_camera(
     that the world has is not seen."""
     image = at_most(image, _WIDEST)
     target = np.asarray(scene.pivot, np.float64)
-    if scene.world.table:
+    if scene.world.table_visible:
         T_world_camera = over_table(table_frame(find_plane(points), points), _DRAWS, target, rng)
     else:
         T_world_camera = prior.draw(_DRAWS, target, points.mean(0), rng)
@@ -108,8 +108,8 @@ def find_camera(
 
 def likeliest(
     T_world_camera: Float[np.ndarray, "N 4 4"],
-    scene: Scene,
-    image: Image,
+    scene: TrackedScene,
+    image: ScoredImage,
     window: int,
     devices: tuple[jax.Device, ...] = (),
 ) -> Float[np.ndarray, "4 4"]:
@@ -125,8 +125,8 @@ def likeliest(
 @partial(jax.jit, static_argnames=("sigma", "window", "devices"))
 def _scores(
     T_camera_world: Float[Array, "N 4 4"],
-    image: Image,
-    scene: Scene,
+    image: ScoredImage,
+    scene: TrackedScene,
     sigma: float,
     window: int,
     devices: tuple[jax.Device, ...],
@@ -138,15 +138,15 @@ def _scores(
 
 @partial(jax.jit, static_argnames="devices")
 def _all_aligned(
-    T_camera_world: Float[Array, "N 4 4"], image: Image, scene: Scene, devices: tuple[jax.Device, ...]
+    T_camera_world: Float[Array, "N 4 4"], image: ScoredImage, scene: TrackedScene, devices: tuple[jax.Device, ...]
 ) -> Float[Array, "N 4 4"]:
-    def some(T: Float[Array, "M 4 4"], image: Image, scene: Scene) -> Float[Array, "M 4 4"]:
+    def some(T: Float[Array, "M 4 4"], image: ScoredImage, scene: TrackedScene) -> Float[Array, "M 4 4"]:
         return jax.lax.map(lambda each: _aligned(each, image, scene), T)
 
     return over_devices(some, devices)(T_camera_world, image, scene)
 
 
-def _aligned(T_camera_world: Float[Array, "4 4"], image: Image, scene: Scene) -> Float[Array, "4 4"]:
+def _aligned(T_camera_world: Float[Array, "4 4"], image: ScoredImage, scene: TrackedScene) -> Float[Array, "4 4"]:
     centre = scene.pivot_seen(T_camera_world)
 
     def pose(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:

@@ -16,7 +16,7 @@ from bayes3d_ros.geometry.se3 import exp_about, inverse, log_about, product, qua
 from bayes3d_ros.likelihood.camera_score import World, render_cameras
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.likelihood.noise import for_returns, noise_grid
-from bayes3d_ros.likelihood.scored_image import Image, array_shape, scored_image
+from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape, scored_image
 from bayes3d_ros.likelihood.sharding import on_all
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
@@ -28,7 +28,7 @@ from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking import marginal_filter
 from bayes3d_ros.tracking.camera_errors import pose_covariance
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
-from bayes3d_ros.tracking.depth_alignment import Scene, rendered_slopes
+from bayes3d_ros.tracking.depth_alignment import TrackedScene, rendered_slopes
 from bayes3d_ros.tracking.relocalise import LookAt, find_camera, likeliest
 
 _NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
@@ -47,8 +47,8 @@ class Tracking:
     """What is known between two frames."""
 
     world: KnownWorld
-    scene: Scene
-    particles: marginal_filter.State
+    scene: TrackedScene
+    particles: marginal_filter.FilterState
     stamp_ns: int | None = None  # of the last frame
     frame_time: float = 0.0  # seconds between the last two frames
 
@@ -86,13 +86,13 @@ class CameraTracker:
         missing = sorted(set(world.types) - set(self.library.names))
         if missing:
             raise WorldError(f"expected objects of the library, it has no {', '.join(missing)}")
-        kind = jnp.array([self.library.names.index(name) for name in world.types], jnp.int32)
+        type_id = jnp.array([self.library.names.index(name) for name in world.types], jnp.int32)
         placed = jnp.asarray(world.T_world_object, jnp.float32)
         pivot = jnp.asarray(self._spheres(world)[0].mean(0), jnp.float32)
-        scene = Scene(World(kind, placed, jnp.asarray(world.table)), self._arrays, pivot)
+        scene = TrackedScene(World(type_id, placed, jnp.asarray(world.table_visible)), self._arrays, pivot)
         return Tracking(world, on_all(scene, self._devices), self._at_rest(T_world_camera))
 
-    def _at_rest(self, T_world_camera: Float[np.ndarray, "4 4"]) -> marginal_filter.State:
+    def _at_rest(self, T_world_camera: Float[np.ndarray, "4 4"]) -> marginal_filter.FilterState:
         _, own = marginal_filter.shares(self.settings.hypotheses)
         T_camera_world = jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32)
         return on_all(marginal_filter.start(T_camera_world, own, 0.4 * self.settings.sigma_max), self._devices)
@@ -114,7 +114,7 @@ class CameraTracker:
             before = before._replace(motion=_slower(before.motion, jnp.float32(ratio)))
         expected = marginal_filter.expected_pose(before)
         image = self._image(frame, known.world, np.asarray(expected, np.float64))
-        grid = for_returns(self._grid, image.kind, image.weight)
+        grid = for_returns(self._grid, image.pixel_class, image.weight)
         motion = marginal_filter.Motion(
             np.float32(settings.speed_change * seconds), np.float32(settings.turn_change * seconds)
         )
@@ -195,7 +195,9 @@ class CameraTracker:
         centres = np.einsum("kab,kb->ka", world.T_world_object[:, :3, :3], local) + world.T_world_object[:, :3, 3]
         return centres, np.array([0.5 * np.linalg.norm(m.box_size) for m in models])
 
-    def _image(self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"] | None) -> Image:
+    def _image(
+        self, frame: DepthFrame, world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"] | None
+    ) -> ScoredImage:
         """The image at scoring resolution. What lies neither near the table nor near an object, as far as the expected
         pose tells, is none of the world's: not scored where there is a table, else beyond the objects. Without a pose
         any return may be the world's."""
@@ -205,14 +207,14 @@ class CameraTracker:
             raise TrackingError(f"the depth image has no return between {settings.near} and {settings.far} m")
         points = unproject(np.where(returned, depth, np.nan), camera)
         if T_camera_world is None:
-            kind = np.where(returned, IN_WORKSPACE, NO_RETURN)
+            pixel_class = np.where(returned, IN_WORKSPACE, NO_RETURN)
         else:
-            kind = self._kinds(points, world, T_camera_world)
+            pixel_class = self._pixel_classes(points, world, T_camera_world)
         depth, nothing = np.where(returned, depth, 0.0), np.full(depth.shape, np.inf)
-        image = scored_image(camera, depth, kind, nothing, settings.near, settings.far, settings.sigma_max)
+        image = scored_image(camera, depth, pixel_class, nothing, settings.near, settings.far, settings.sigma_max)
         return on_all(image, self._devices)
 
-    def _kinds(
+    def _pixel_classes(
         self, points: Float[np.ndarray, "H W 3"], world: KnownWorld, T_camera_world: Float[np.ndarray, "4 4"]
     ) -> np.ndarray:
         returned = np.isfinite(points[..., 2])
@@ -221,7 +223,7 @@ class CameraTracker:
             middle = T_camera_world[:3, :3] @ centre + T_camera_world[:3, 3]
             with np.errstate(invalid="ignore"):
                 near |= ((points - middle) ** 2).sum(-1) < (radius + _NEAR_OBJECT) ** 2
-        if world.table:
+        if world.table_visible:
             height = (points - T_camera_world[:3, 3]) @ T_camera_world[:3, 2]
             with np.errstate(invalid="ignore"):
                 near |= np.abs(height) < _NEAR_TABLE[0] + _NEAR_TABLE[1] * points[..., 2]
@@ -247,7 +249,7 @@ def _slower(motion: Float[Array, "N 4 4"], ratio: Float[Array, ""]) -> Float[Arr
 
 
 def _smooth_covariance(
-    T_camera_world: Float[Array, "4 4"], image: Image, scene: Scene, error: SmoothError
+    T_camera_world: Float[Array, "4 4"], image: ScoredImage, scene: TrackedScene, error: SmoothError
 ) -> tuple[Float[Array, "6 6"], Float[Array, ""], Float[Array, ""]]:
     """What smooth errors add to the covariance of (shift, turn) about the pivot, on the camera's axes; the share of the
     objects' pixels that are explained, and how many there are."""
@@ -261,9 +263,9 @@ def _smooth_covariance(
     points = depth[..., None] * jnp.stack([*rays, jnp.ones_like(depth)], -1)
     inner = seen & (jnp.abs(slope[:3]).max(0) < _STEEP)
     covariance = pose_covariance(jnp.where(inner, slope, 0.0), inner, points, error)
-    objects = scene.world._replace(table=jnp.asarray(False))
+    objects = scene.world._replace(table_visible=jnp.asarray(False))
     alone = render_cameras(T_camera_world[None], objects, image, scene.library)[0]
-    own = jnp.isfinite(alone) & (alone < jnp.where(seen, depth, jnp.inf) + 1e-3) & (image.kind != NO_RETURN)
+    own = jnp.isfinite(alone) & (alone < jnp.where(seen, depth, jnp.inf) + 1e-3) & (image.pixel_class != NO_RETURN)
     near = jnp.abs(image.depth - alone) < _EXPLAINED[0] + _EXPLAINED[1] * alone
     count = own.sum()
     apart = jnp.where(own, ((points - pivot)[..., :2] ** 2).sum(-1), 0.0)

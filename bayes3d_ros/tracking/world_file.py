@@ -16,17 +16,17 @@ _FAR = 1e6  # metres
 _KEYS = ("type", "position", "orientation")
 
 
-def load_world(path: Path, table: bool, library: Library) -> KnownWorld:
+def load_world(path: Path, table_visible: bool, library: Library) -> KnownWorld:
     """Read `objects`: a list of type (of the library), position (metres) and orientation (x y z w), in the frame of the
     world. Raises WorldError, one line naming the file, the key and what was expected."""
     content = read_yaml(path, "world file", WorldError)
     try:
-        return _world(content, table, library.names)
+        return _world(content, table_visible, library.names)
     except ValueError as error:
         raise WorldError(f"{path}: {error}") from None
 
 
-def _world(content: Any, table: bool, names: Sequence[str]) -> KnownWorld:
+def _world(content: Any, table_visible: bool, names: Sequence[str]) -> KnownWorld:
     if not isinstance(content, dict) or set(content) != {"objects"} or not isinstance(content["objects"], list):
         raise ValueError("expected one key, objects, with a list")
     if not content["objects"]:
@@ -44,7 +44,7 @@ def _world(content: Any, table: bool, names: Sequence[str]) -> KnownWorld:
             raise ValueError(f"{where}.orientation: expected a quaternion x y z w of length 1, got {orientation}")
         types.append(thing["type"])
         poses.append(pose_matrix(position, orientation))
-    return KnownWorld(tuple(types), np.array(poses), table)
+    return KnownWorld(tuple(types), np.array(poses), table_visible)
 
 
 def _numbers(value: Any, key: str, count: int) -> Float[np.ndarray, "n"]:

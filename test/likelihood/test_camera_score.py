@@ -12,7 +12,7 @@ from bayes3d_ros.likelihood.cpu.gain import compiled_gain
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 WIDTH, HEIGHT, WINDOW = 42, 30, 3
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.4]))
@@ -59,15 +59,15 @@ def image(arrays, cameras):
     x, y = (np.arange(WIDTH) - CENTRE[0]) / FOCAL[0], (np.arange(HEIGHT) - CENTRE[1]) / FOCAL[1]
     seen = depth_along(cameras[0], WORLDS["on a table"], arrays, rays())
     depth = np.where(np.isfinite(seen), seen, 2.0) + rng.normal(0, 0.003, seen.shape)
-    kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
-    return Image(
-        depth=jnp.float32(np.where(kind == NO_RETURN, 0, depth)),
-        kind=jnp.asarray(kind, jnp.int32),
+    pixel_class = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
+    return ScoredImage(
+        depth=jnp.float32(np.where(pixel_class == NO_RETURN, 0, depth)),
+        pixel_class=jnp.asarray(pixel_class, jnp.int32),
         ray_x=jnp.float32(x),
         ray_y=jnp.float32(y),
         focal=jnp.float32(FOCAL),
         centre=jnp.float32(CENTRE),
-        table=jnp.full((HEIGHT, WIDTH), jnp.inf),
+        bare_depth=jnp.full((HEIGHT, WIDTH), jnp.inf),
         outlier_scale=jnp.float32(3 / (5.0**3 - 0.1**3)),
         front_margin=jnp.float32(0.015),
     )

@@ -11,7 +11,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.cpu import loops
 from bayes3d_ros.likelihood.cpu.gain import compiled_depth, compiled_gain
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 
@@ -75,7 +75,7 @@ def test_every_window(window, drawn, image, arrays):
     """Over a scene, which the hypotheses hide in part; what they are compared with is drawn by the kernel itself."""
     scene = np.full((1, HEIGHT, WIDTH), np.inf, np.float32)
     scene[:, :, WIDTH // 2 :] = 0.52
-    scenes = Scenes(pad_scene(jnp.asarray(scene), window), jnp.zeros(COUNT, jnp.int32))
+    scenes = SceneDepths(pad_scene(jnp.asarray(scene), window), jnp.zeros(COUNT, jnp.int32))
     gain = np.asarray(compiled_gain(drawn, scenes, image, arrays, NOISE, window))
     depth = jnp.minimum(compiled_depth(drawn, None, image, arrays), scene)
     after, before = (log_likelihood_scene(pad_scene(d, window), image, NOISE, window) for d in (depth, scene))

@@ -25,14 +25,14 @@ density = jax.jit(inlier_density, static_argnames="window")
 score = jax.jit(log_likelihood, static_argnames="window")
 
 
-def make_pixels(depth, kind=None):
+def make_pixels(depth, pixel_class=None):
     """Pixels of a camera whose axis goes through the middle; depth [h, w, T]."""
     height, width = depth.shape[:2]
-    kind = np.full(depth.shape, IN_WORKSPACE) if kind is None else kind
+    pixel_class = np.full(depth.shape, IN_WORKSPACE) if pixel_class is None else pixel_class
     x, y = (np.arange(width) - (width - 1) / 2) / FOCAL, (np.arange(height) - (height - 1) / 2) / FOCAL
     return Pixels(
         depth=jnp.asarray(depth, jnp.float32),
-        kind=jnp.asarray(kind, jnp.int32),
+        pixel_class=jnp.asarray(pixel_class, jnp.int32),
         ray_x=jnp.broadcast_to(jnp.asarray(x, jnp.float32)[:, None], depth.shape),
         ray_y=jnp.broadcast_to(jnp.asarray(y, jnp.float32)[:, None, None], depth.shape),
         step_x=jnp.float32(1 / FOCAL),
@@ -128,8 +128,8 @@ def test_integrates_to_one_over_depth(name, ray):
     z = np.concatenate([np.linspace(NEAR, FAR, 4000), np.linspace(0.3, 1.0, 14000)])
     z = np.unique(z.astype(np.float32))
     rest = np.full((1, 3, len(z)), 1.0)
-    kind = np.broadcast_to(np.array([IN_WORKSPACE, *[NO_RETURN] * 3])[None, :, None], (1, 4, len(z)))
-    pixels = make_pixels(np.concatenate([z[None, None], rest], 1), kind)
+    pixel_class = np.broadcast_to(np.array([IN_WORKSPACE, *[NO_RETURN] * 3])[None, :, None], (1, 4, len(z)))
+    pixels = make_pixels(np.concatenate([z[None, None], rest], 1), pixel_class)
     pixels = pixels._replace(ray_x=jnp.full(pixels.depth.shape, ray[0]), ray_y=jnp.full(pixels.depth.shape, ray[1]))
     rendered = np.full((3, 6, 1), np.inf, np.float32)
     rendered[:, :3, 0] = window
@@ -140,10 +140,10 @@ def test_integrates_to_one_over_depth(name, ray):
     np.testing.assert_allclose(np.trapezoid(whole, z, axis=-1), 1, atol=3e-4)
 
 
-def one_pixel(depth, kind, rendered, noise, window=3):
+def one_pixel(depth, pixel_class, rendered, noise, window=3):
     """Log likelihood of a pixel whose window is flat; the tile's other pixels have no return."""
     depths = np.array([depth, 1.0, 1.0, 1.0]).reshape(1, 4, 1)
-    pixels = make_pixels(depths, np.array([kind, *[NO_RETURN] * 3]).reshape(1, 4, 1))
+    pixels = make_pixels(depths, np.array([pixel_class, *[NO_RETURN] * 3]).reshape(1, 4, 1))
     half = window // 2
     image = np.full((1 + 2 * half, 4 + 2 * half, 1), rendered, np.float32)
     return np.asarray(score(jnp.asarray(image), pixels, noise, window))[..., 0]
@@ -185,23 +185,27 @@ def tiles():
     depth = (
         middle + rng.normal(0, 0.002, middle.shape) + (rng.random(middle.shape) < 0.1) * rng.uniform(0, 1, middle.shape)
     )
-    kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], middle.shape, p=[0.2, 0.6, 0.2])
-    return jnp.asarray(rendered, jnp.float32), make_pixels(np.where(kind == NO_RETURN, 0, depth), kind)
+    pixel_class = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], middle.shape, p=[0.2, 0.6, 0.2])
+    return jnp.asarray(rendered, jnp.float32), make_pixels(np.where(pixel_class == NO_RETURN, 0, depth), pixel_class)
 
 
 def test_sums_the_logs_of_pixels(tiles):
     rendered, pixels = tiles
     got = np.asarray(score(rendered, pixels, NOISE, 3))
     inlier = np.asarray(density(rendered, pixels, NOISE.sigma, 3), np.float64)[:, None]  # S 1 h w T
-    depth, kind = np.asarray(pixels.depth, np.float64), np.asarray(pixels.kind)
+    depth, pixel_class = np.asarray(pixels.depth, np.float64), np.asarray(pixels.pixel_class)
     p = np.asarray(NOISE.p_outlier, np.float64)[None, :, None, None, None]
     a = SCALE * depth**2
     blocked = np.asarray(rendered)[1:-1, 1:-1] < depth + MARGIN
     with np.errstate(divide="ignore"):
         inside = np.log(p * a + (1 - p) * inlier)
         beyond = np.where(blocked, np.log(p * a), np.log(a))
-    expected = np.where(kind == IN_WORKSPACE, inside, np.where(kind == BEYOND, beyond, 0.0)).sum((2, 3))
-    assert (kind == BEYOND).sum() > 50 and blocked[kind == BEYOND].any() and not blocked[kind == BEYOND].all()
+    expected = np.where(pixel_class == IN_WORKSPACE, inside, np.where(pixel_class == BEYOND, beyond, 0.0)).sum((2, 3))
+    assert (
+        (pixel_class == BEYOND).sum() > 50
+        and blocked[pixel_class == BEYOND].any()
+        and not blocked[pixel_class == BEYOND].all()
+    )
     np.testing.assert_allclose(got, expected, rtol=2e-6, atol=2e-3)
 
 
@@ -215,7 +219,9 @@ def test_a_weight_is_a_share_of_every_log_likelihood(tiles):
 def test_tiles_do_not_see_each_other(tiles):
     rendered, pixels = tiles
     order = np.random.default_rng(0).permutation(rendered.shape[-1])
-    shuffled = pixels._replace(**{f: getattr(pixels, f)[..., order] for f in ("depth", "kind", "ray_x", "ray_y")})
+    shuffled = pixels._replace(
+        **{f: getattr(pixels, f)[..., order] for f in ("depth", "pixel_class", "ray_x", "ray_y")}
+    )
     before = np.asarray(score(rendered, pixels, NOISE, 3))
     assert len(np.unique(before[0, 0])) == len(order)
     np.testing.assert_allclose(

@@ -15,7 +15,7 @@ from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Like
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.likelihood.scored_image import array_shape, halved, padded_height, scored_image
-from bayes3d_ros.objects.placement import Contact, Table
+from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.search import evidence_left
 
 CAMERA = Intrinsics(50.0, 52.0, 20.3, 14.6, 42, 25)
@@ -55,59 +55,59 @@ def images(request, table):
     T = np.asarray(table.T_camera_table, np.float64)
     bare = T[:3, 2] @ T[:3, 3] / (CAMERA.rays() @ T[:3, 2])
     depth = bare + rng.normal(0, 0.003, bare.shape) + (rng.random(bare.shape) < 0.05) * 0.3
-    kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
-    depth = np.where(kind == NO_RETURN, 0, depth)
+    pixel_class = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
+    depth = np.where(pixel_class == NO_RETURN, 0, depth)
     more = jax.device_put(
-        scored_image(CAMERA, depth, kind, bare, 0.1, 5.0, 0.005, likelihood=Likelihood(request.param))
+        scored_image(CAMERA, depth, pixel_class, bare, 0.1, 5.0, 0.005, likelihood=Likelihood(request.param))
     )
-    own = {name: getattr(more, name)[:ROWS] for name in ("depth", "kind", "table", "ray_y")}
+    own = {name: getattr(more, name)[:ROWS] for name in ("depth", "pixel_class", "bare_depth", "ray_y")}
     return SimpleNamespace(tight=more._replace(rows=None, **own), padded=more)
 
 
 @pytest.fixture(scope="module")
-def contacts():
+def placements():
     """On the table, many of them beyond the lower edge of the image in part."""
     rng = np.random.default_rng(1)
     n = 12
     x, y, yaw = (rng.uniform(low, high, n) for low, high in ((-0.3, 0.3), (-0.35, 0.2), (0, 6.28)))
-    kind, face = rng.integers(0, 5, n), rng.integers(0, 6, n)
-    return Contact(jnp.asarray(kind), jnp.asarray(face), jnp.float32(x), jnp.float32(y), jnp.float32(yaw))
+    type_id, face = rng.integers(0, 5, n), rng.integers(0, 6, n)
+    return Placement(jnp.asarray(type_id), jnp.asarray(face), jnp.float32(x), jnp.float32(y), jnp.float32(yaw))
 
 
 def test_rays_go_on_below_and_nothing_returned_there(images):
     image = images.padded
     assert image.depth.shape == (32, 42) and int(image.own_rows) == ROWS
     np.testing.assert_allclose(np.diff(image.ray_y), 1 / CAMERA.fy, atol=1e-6)
-    assert (image.kind[ROWS:] == NO_RETURN).all() and not image.depth[ROWS:].any()
-    assert np.isinf(image.table[ROWS:]).all()
+    assert (image.pixel_class[ROWS:] == NO_RETURN).all() and not image.depth[ROWS:].any()
+    assert np.isinf(image.bare_depth[ROWS:]).all()
     half = halved(image)
     assert half.depth.shape == (16, 21) and int(half.own_rows) == 13 == halved(images.tight).own_rows
 
 
-def gains(kernel, contacts, image, arrays, table):
+def gains(kernel, placements, image, arrays, table):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_score, "kernel", lambda image: kernel)
         # A function of its own: of the same one JAX would take what it traced for another kernel.
         gain = jax.jit(lambda *arguments: log_likelihood_gain.__wrapped__(*arguments, WINDOW))
-        scenes, ancestor = pad_scene(image.table[None], WINDOW), jnp.zeros(len(contacts.x), jnp.int32)
-        return np.asarray(gain(contacts, ancestor, scenes, image, arrays, table, NOISE))
+        scenes, ancestor = pad_scene(image.bare_depth[None], WINDOW), jnp.zeros(len(placements.x), jnp.int32)
+        return np.asarray(gain(placements, ancestor, scenes, image, arrays, table, NOISE))
 
 
 @pytest.mark.parametrize("kernel", [compiled_gain, triton_gain, None], ids=["loops", "triton", "tiles"])
-def test_hypotheses_gain_the_same(images, contacts, arrays, table, kernel):
+def test_hypotheses_gain_the_same(images, placements, arrays, table, kernel):
     if kernel and images.padded.likelihood.name == "points":
         pytest.skip("free points are scored by tiles")
-    tight, padded = (gains(kernel, contacts, image, arrays, table) for image in (images.tight, images.padded))
+    tight, padded = (gains(kernel, placements, image, arrays, table) for image in (images.tight, images.padded))
     np.testing.assert_allclose(padded, tight, rtol=1e-6, atol=1e-5)
     if images.padded.likelihood.name == "depth":  # what is drawn below the last row would be in the windows of that row
-        drawn_below = gains(kernel, contacts, images.padded._replace(rows=None), arrays, table)
+        drawn_below = gains(kernel, placements, images.padded._replace(rows=None), arrays, table)
         assert np.abs(drawn_below - tight).max() > 0.1
 
 
-def test_scenes_are_drawn_and_scored_the_same(images, contacts, arrays, table):
+def test_scenes_are_drawn_and_scored_the_same(images, placements, arrays, table):
     def scenes(image):
-        start = jnp.stack([pad_scene(image.table, WINDOW)] * len(contacts.x))
-        return draw_objects(contacts, start, image, arrays, table, WINDOW)
+        start = jnp.stack([pad_scene(image.bare_depth, WINDOW)] * len(placements.x))
+        return draw_objects(placements, start, image, arrays, table, WINDOW)
 
     tight, padded = scenes(images.tight), scenes(images.padded)
     below = ROWS + WINDOW // 2
@@ -122,7 +122,7 @@ def test_scenes_are_drawn_and_scored_the_same(images, contacts, arrays, table):
 
 def test_consensus_finds_nothing_below(images, table):
     noise = Noise(jnp.float32([0.003]), jnp.float32([0.5]))  # so many outliers that neighbours are asked
-    tight, padded = (evidence_left(image.table, image, noise) for image in (images.tight, images.padded))
+    tight, padded = (evidence_left(image.bare_depth, image, noise) for image in (images.tight, images.padded))
     for one, other in zip(tight, padded, strict=True):
         np.testing.assert_array_equal(one, other[:ROWS])
     assert not padded.depth[ROWS:].any()

@@ -33,17 +33,17 @@ def rays(height, width, focal=FOCAL):
     return np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
 
 
-def make_pixels(depth, beside=(0.0, 0.0), kind=None, likelihood="points", focal=FOCAL):
+def make_pixels(depth, beside=(0.0, 0.0), pixel_class=None, likelihood="points", focal=FOCAL):
     """Depth [h, w, T] at points beside their pixels' rays by so many pixels (u, v), each [h, w, T] or a number."""
     ray = rays(*depth.shape[:2], focal)[..., None]
-    kind = np.full(depth.shape, IN_WORKSPACE) if kind is None else kind
+    pixel_class = np.full(depth.shape, IN_WORKSPACE) if pixel_class is None else pixel_class
 
     def everywhere(a):
         return jnp.asarray(np.broadcast_to(a, depth.shape), jnp.float32)
 
     return Pixels(
         depth=everywhere(depth),
-        kind=jnp.asarray(kind, jnp.int32),
+        pixel_class=jnp.asarray(pixel_class, jnp.int32),
         ray_x=everywhere(ray[:, :, 0]),
         ray_y=everywhere(ray[:, :, 1]),
         step_x=jnp.float32(1 / focal),
@@ -127,16 +127,18 @@ def test_sums_the_logs_of_pixels():
     rendered = surface() + rng.choice([0.0, 4.0], (9, 10))
     rendered, shape = rendered[:8], (8, 10, 1)
     depth = np.where(np.isfinite(rendered), rendered, 0.8)[..., None] + (rng.random(shape) < 0.2) * 0.1
-    kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], shape, p=[0.2, 0.6, 0.2])
+    pixel_class = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], shape, p=[0.2, 0.6, 0.2])
     noise = Noise(jnp.array([1e-5, 0.005]), jnp.array([2e-4, 0.3, 0.9]))
-    pixels = make_pixels(depth, kind=kind)
+    pixels = make_pixels(depth, pixel_class=pixel_class)
     got = np.asarray(score(pad(rendered), pixels, noise, WINDOW))[..., 0]
     inlier = np.asarray(density(pad(rendered), pixels, noise.sigma, WINDOW), np.float64)[:, None]
     p, a = np.asarray(noise.p_outlier, np.float64)[None, :, None, None, None], SCALE * depth**2
     blocked = rendered[..., None] < depth + 0.015
     with np.errstate(divide="ignore"):
         beyond = np.where(blocked, np.log(p * a), np.log(a))
-        terms = np.where(kind == IN_WORKSPACE, np.log(p * a + (1 - p) * inlier), np.where(kind == BEYOND, beyond, 0.0))
+        terms = np.where(
+            pixel_class == IN_WORKSPACE, np.log(p * a + (1 - p) * inlier), np.where(pixel_class == BEYOND, beyond, 0.0)
+        )
     assert inlier.max() > 1e8
     np.testing.assert_allclose(got, terms.sum((2, 3, 4)), rtol=1e-5)
 

@@ -20,9 +20,9 @@ def cast(arrays):
     """cast(type, T_camera_object, x, y): depth along rays (x, y, 1), compiled once a shape."""
     compiled = jax.jit(march)
 
-    def run(kind, pose, x, y):
+    def run(type_id, pose, x, y):
         rays = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
-        return np.asarray(compiled(arrays, jnp.asarray(kind, jnp.int32), jnp.asarray(pose, jnp.float32), rays))
+        return np.asarray(compiled(arrays, jnp.asarray(type_id, jnp.int32), jnp.asarray(pose, jnp.float32), rays))
 
     return run
 
@@ -54,17 +54,17 @@ def as_packed(model):
     return packed
 
 
-@pytest.mark.parametrize("kind", range(5))
-def test_like_the_reference(cast, library, kind):
+@pytest.mark.parametrize("type_id", range(5))
+def test_like_the_reference(cast, library, type_id):
     """The same rays hit. Both meet planes of voxels that the ray enters, one the first that serves, the other the
     nearest: the fast one is never nearer, and seldom farther by much."""
-    model, rng = library.models[kind], np.random.default_rng(kind)
+    model, rng = library.models[type_id], np.random.default_rng(type_id)
     x, y = pixel_rays()
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     away = []
     for _ in range(2):
         pose = centred(model, random_pose(rng))
-        fast = cast(kind, pose, x, y).ravel()
+        fast = cast(type_id, pose, x, y).ravel()
         slow = render(as_packed(model), pose, rays)
         hit = np.isfinite(slow)
         assert not np.isnan(fast).any()
@@ -159,8 +159,8 @@ def test_rays_that_miss(cast):
     for place in ([5.0, 0, 0.5], [0, 0, -0.5], [0, 5.0, 0.01]):  # beside, behind the camera, beside it
         pose = np.eye(4)
         pose[:3, 3] = place
-        for kind in range(5):
-            assert np.isposinf(cast(kind, pose, x, y)).all()
+        for type_id in range(5):
+            assert np.isposinf(cast(type_id, pose, x, y)).all()
 
 
 def test_never_nan_nor_behind(cast):
@@ -171,8 +171,8 @@ def test_never_nan_nor_behind(cast):
         pose = random_pose(rng, (-0.1, -0.1, -0.1), (0.1, 0.1, 0.2))
         if n % 2:
             pose[:3, :3] = np.eye(3)[rng.permutation(3)]
-        for kind in range(5):
-            depth = cast(kind, pose, x, y)
+        for type_id in range(5):
+            depth = cast(type_id, pose, x, y)
             assert not np.isnan(depth).any() and (depth > 0).all()
 
 

@@ -11,8 +11,8 @@ from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Like
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
-from bayes3d_ros.likelihood.scored_image import FreePoints, Image, halved
-from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.likelihood.scored_image import FreePoints, ScoredImage, halved
+from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 
 WIDTH, HEIGHT, WINDOW = 42, 30, 3  # no multiples of the tiles' side
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.4]))
@@ -47,22 +47,22 @@ def image(table):
     depth = np.where(np.isfinite(bare), bare, 3.0)
     depth[10:20, 15:28] -= 0.1
     depth += rng.normal(0, 0.003, depth.shape) + (rng.random(depth.shape) < 0.05) * 0.3
-    kind = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
-    return Image(
-        depth=jnp.float32(np.where(kind == NO_RETURN, 0, depth)),
-        kind=jnp.asarray(kind, jnp.int32),
+    pixel_class = rng.choice([NO_RETURN, IN_WORKSPACE, BEYOND], depth.shape, p=[0.15, 0.75, 0.1])
+    return ScoredImage(
+        depth=jnp.float32(np.where(pixel_class == NO_RETURN, 0, depth)),
+        pixel_class=jnp.asarray(pixel_class, jnp.int32),
         ray_x=jnp.float32(x),
         ray_y=jnp.float32(y),
         focal=jnp.float32(focal),
         centre=jnp.float32(centre),
-        table=jnp.float32(bare),
+        bare_depth=jnp.float32(bare),
         outlier_scale=jnp.float32(3 / (5.0**3 - 0.1**3)),
         front_margin=jnp.float32(0.015),
     )
 
 
 @pytest.fixture(scope="module")
-def contacts(table):
+def placements(table):
     """On the table: most in sight, some partly or wholly outside of the image, some behind the camera or about it."""
     rng = np.random.default_rng(1)
     n = 48
@@ -70,25 +70,25 @@ def contacts(table):
     x[40:44], y[40:44] = [0.5, -0.5, 0.35, -0.35], [0.0, 0.1, -0.3, 0.4]
     eye = -np.asarray(table.T_camera_table)[:3, :3].T @ np.asarray(table.T_camera_table)[:3, 3]
     x[44:], y[44:] = [0.0, 0.05, 3.0, 0.0], [eye[1] - 1.0, eye[1] - 2.0, -3.0, eye[1]]
-    return Contact(
+    return Placement(
         jnp.asarray(rng.integers(0, 5, n)), jnp.asarray(rng.integers(0, 6, n)), jnp.asarray(x, jnp.float32),
         jnp.asarray(y, jnp.float32), jnp.asarray(rng.uniform(0, 2 * np.pi, n), jnp.float32),
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def drawn(contacts, image, arrays, table):
+def drawn(placements, image, arrays, table):
     """Depth of each object alone over the whole image."""
-    T = T_camera_object(contacts, arrays, table)
-    shape = (HEIGHT, WIDTH, len(contacts.x))
+    T = T_camera_object(placements, arrays, table)
+    shape = (HEIGHT, WIDTH, len(placements.x))
     rays = jnp.broadcast_to(image.ray_x[:, None], shape), jnp.broadcast_to(image.ray_y[:, None, None], shape)
-    return np.asarray(jax.jit(march)(arrays, contacts.type, T, rays)).transpose(2, 0, 1)
+    return np.asarray(jax.jit(march)(arrays, placements.type, T, rays)).transpose(2, 0, 1)
 
 
 @pytest.fixture(scope="module")
 def ancestors(image, drawn):
     """Depth of three scenes: the bare table, with one object, and with two."""
-    bare = np.asarray(image.table)
+    bare = np.asarray(image.bare_depth)
     one = np.minimum(bare, drawn[3])
     return np.stack([bare, one, np.minimum(one, drawn[7])])
 
@@ -114,12 +114,12 @@ def gain_by(kernel, *arguments):
 
 
 @pytest.fixture(scope="module", params=[compiled_gain, triton_gain, None])
-def gains(request, contacts, drawn, ancestors, image, arrays, table):
-    """Gains of the contacts, each over one of the ancestors, by either way; and from whole images."""
+def gains(request, placements, drawn, ancestors, image, arrays, table):
+    """Gains of the placements, each over one of the ancestors, by either way; and from whole images."""
     ancestor = np.arange(len(drawn)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
     over = jnp.asarray(ancestor), scenes, image, arrays, table
-    gain = np.asarray(gain_by(request.param, contacts, *over, NOISE, WINDOW))
+    gain = np.asarray(gain_by(request.param, placements, *over, NOISE, WINDOW))
     after = np.minimum(ancestors[ancestor], drawn)
     after = np.asarray(whole(pad_scene(jnp.asarray(after), WINDOW), image, NOISE, WINDOW))
     before = np.asarray(whole(scenes, image, NOISE, WINDOW))[ancestor]
@@ -138,10 +138,10 @@ def test_gain_at_the_rim_of_the_image(gains, at_the_rim):
     np.testing.assert_allclose(gain, expected, atol=0.01, rtol=1e-5)
 
 
-def test_drawing_objects(contacts, drawn, ancestors, image, arrays, table):
+def test_drawing_objects(placements, drawn, ancestors, image, arrays, table):
     before = ancestors[np.arange(len(drawn)) % 3]
     scenes = pad_scene(jnp.asarray(before, jnp.float32), WINDOW)
-    after = with_objects(contacts, scenes, image, arrays, table, WINDOW)
+    after = with_objects(placements, scenes, image, arrays, table, WINDOW)
     expected = pad_scene(jnp.asarray(np.minimum(before, drawn)), WINDOW)
     np.testing.assert_allclose(np.asarray(after), np.asarray(expected), rtol=1e-5)
 
@@ -153,22 +153,22 @@ def test_likelihood_of_a_scene_sums_over_every_pixel(image, ancestors):
     parts = np.zeros_like(total)
     stripe = np.arange(HEIGHT) % 5
     for k in range(5):
-        kind = jnp.where(jnp.asarray(stripe == k)[:, None], image.kind, NO_RETURN)
-        parts += np.asarray(whole(scene, image._replace(kind=kind), NOISE, WINDOW))[0]
+        pixel_class = jnp.where(jnp.asarray(stripe == k)[:, None], image.pixel_class, NO_RETURN)
+        parts += np.asarray(whole(scene, image._replace(pixel_class=pixel_class), NOISE, WINDOW))[0]
     np.testing.assert_allclose(total, parts, rtol=1e-5)
 
 
-def test_halved(image, contacts, arrays, table):
+def test_halved(image, placements, arrays, table):
     """Pixel (u, v) of the half image is pixel (2u, 2v): the same ray, return and table."""
     half = halved(image)
-    assert half.depth.shape == (-(-HEIGHT // 2), -(-WIDTH // 2)) == half.kind.shape == half.table.shape
+    assert half.depth.shape == (-(-HEIGHT // 2), -(-WIDTH // 2)) == half.pixel_class.shape == half.bare_depth.shape
     u, v = np.arange(half.depth.shape[1]), np.arange(half.depth.shape[0])
     np.testing.assert_allclose(half.ray_x, (u - half.centre[0]) / half.focal[0], atol=1e-6)
     np.testing.assert_allclose(half.ray_y, (v - half.centre[1]) / half.focal[1], atol=1e-6)
     np.testing.assert_array_equal(half.ray_x, image.ray_x[2 * u])
     np.testing.assert_array_equal(half.depth, image.depth[2 * v[:, None], 2 * u])
-    np.testing.assert_array_equal(half.kind, image.kind[2 * v[:, None], 2 * u])
-    np.testing.assert_array_equal(half.table, image.table[2 * v[:, None], 2 * u])
+    np.testing.assert_array_equal(half.pixel_class, image.pixel_class[2 * v[:, None], 2 * u])
+    np.testing.assert_array_equal(half.bare_depth, image.bare_depth[2 * v[:, None], 2 * u])
 
 
 @pytest.fixture(scope="module")
@@ -178,9 +178,9 @@ def cloud(image):
     step = 1 / np.asarray(image.focal)[:, None, None]
     beside = np.stack([np.zeros((2, HEIGHT, WIDTH)), rng.uniform(-0.5, 0.5, (2, HEIGHT, WIDTH)) * step])
     depth = np.stack([image.depth, image.depth + rng.normal(0, 0.003, image.depth.shape)])
-    second = jnp.asarray(rng.random(image.kind.shape) < 0.5)
-    kind = jnp.stack([image.kind, jnp.where(second, image.kind, NO_RETURN)])
-    points = FreePoints(jnp.float32(depth), kind, *(jnp.float32(beside[:, a]) for a in range(2)))
+    second = jnp.asarray(rng.random(image.pixel_class.shape) < 0.5)
+    pixel_class = jnp.stack([image.pixel_class, jnp.where(second, image.pixel_class, NO_RETURN)])
+    points = FreePoints(jnp.float32(depth), pixel_class, *(jnp.float32(beside[:, a]) for a in range(2)))
     return image._replace(likelihood=Likelihood("points"), points=points)
 
 
@@ -195,10 +195,10 @@ def test_layers_of_free_points_add_up(ancestors, image, cloud):
     assert np.abs(first - np.asarray(whole(scenes, image, NOISE, WINDOW))).min() > 10
 
 
-def test_gain_of_free_points_is_the_difference_of_whole_clouds(contacts, drawn, ancestors, cloud, arrays, table):
+def test_gain_of_free_points_is_the_difference_of_whole_clouds(placements, drawn, ancestors, cloud, arrays, table):
     ancestor = np.arange(len(drawn)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
-    gain = np.asarray(gain_of(contacts, jnp.asarray(ancestor), scenes, cloud, arrays, table, NOISE, WINDOW))
+    gain = np.asarray(gain_of(placements, jnp.asarray(ancestor), scenes, cloud, arrays, table, NOISE, WINDOW))
     after = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], drawn)), WINDOW)
     before = np.asarray(whole(scenes, cloud, NOISE, WINDOW))[ancestor]
     expected = np.asarray(whole(after, cloud, NOISE, WINDOW)) - before

@@ -1,4 +1,4 @@
-"""Contact poses, their prior, and the test of interpenetration."""
+"""Placement poses, their prior, and the test of interpenetration."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,15 +8,15 @@ import trimesh
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact, T_camera_object, T_table_object, Table, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, T_camera_object, T_table_object, Table, log_prior, overlap
 
 BOWL, BOX, SPHERE = 0, 1, 3
 
 
-def contact(kind, face, x=0.0, y=0.0, yaw=0.0):
-    """Contacts of one shape, from numbers or arrays."""
-    kind, face, x, y, yaw = np.broadcast_arrays(kind, face, x, y, yaw)
-    return Contact(jnp.asarray(kind), jnp.asarray(face), *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
+def placement(type_id, face, x=0.0, y=0.0, yaw=0.0):
+    """Placements of one shape, from numbers or arrays."""
+    type_id, face, x, y, yaw = np.broadcast_arrays(type_id, face, x, y, yaw)
+    return Placement(jnp.asarray(type_id), jnp.asarray(face), *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
 
 
 def table_of(width, depth):
@@ -29,7 +29,7 @@ KINDS, FACES = (a.ravel() for a in np.mgrid[:5, :6])
 @pytest.fixture(scope="module")
 def poses(arrays):
     """T_table_object of every model on every face at (0.1, -0.2), turned by 0.7."""
-    return np.asarray(T_table_object(contact(KINDS, FACES, 0.1, -0.2, 0.7), arrays))
+    return np.asarray(T_table_object(placement(KINDS, FACES, 0.1, -0.2, 0.7), arrays))
 
 
 def test_poses_are_rigid(poses):
@@ -43,16 +43,16 @@ def test_poses_are_rigid(poses):
 
 def test_objects_stand_on_the_table(poses, library):
     """The lowest point of the surface is at z = 0, and the contact normal points straight down."""
-    for kind, face, T in zip(KINDS, FACES, poses, strict=True):
-        model = library.models[kind]
+    for type_id, face, T in zip(KINDS, FACES, poses, strict=True):
+        model = library.models[type_id]
         height = model.surface_points @ T[2, :3] + T[2, 3]
         assert abs(height.min()) < 0.6 * model.voxel_size, (model.name, face)
         np.testing.assert_allclose(T[:3, :3] @ model.contact_normal[face], [0, 0, -1], atol=1e-5)
 
 
 def test_the_box_centre_is_above_x_y(poses, library):
-    for kind, T in zip(KINDS, poses, strict=True):
-        centre = T[:3, :3] @ library.models[kind].T_object_box[:3, 3] + T[:3, 3]
+    for type_id, T in zip(KINDS, poses, strict=True):
+        centre = T[:3, :3] @ library.models[type_id].T_object_box[:3, 3] + T[:3, 3]
         np.testing.assert_allclose(centre[:2], [0.1, -0.2], atol=1e-5)
         assert centre[2] > 0
 
@@ -68,11 +68,11 @@ def test_faces_of_a_box(poses, library):
 
 
 def test_yaw_turns_about_the_vertical_through_the_box_centre(poses, arrays):
-    still = np.asarray(T_table_object(contact(KINDS, FACES), arrays))
+    still = np.asarray(T_table_object(placement(KINDS, FACES), arrays))
     c, s = np.cos(0.7), np.sin(0.7)
     slide = np.array([[c, -s, 0, 0.1], [s, c, 0, -0.2], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.testing.assert_allclose(poses, slide @ still, atol=1e-6)
-    around = np.asarray(T_table_object(contact(KINDS, FACES, 0.1, -0.2, 0.7 + 2 * np.pi), arrays))
+    around = np.asarray(T_table_object(placement(KINDS, FACES, 0.1, -0.2, 0.7 + 2 * np.pi), arrays))
     np.testing.assert_allclose(poses, around, atol=2e-6)
 
 
@@ -80,7 +80,7 @@ def test_face_size_is_the_extent_along_x_and_y(arrays, library):
     """Of a box, the rectangle that it covers at yaw 0."""
     model = library.models[BOX]
     for face in range(6):
-        T = np.asarray(T_table_object(contact(BOX, face), arrays))
+        T = np.asarray(T_table_object(placement(BOX, face), arrays))
         extent = np.abs(T[:2, :3] @ model.T_object_box[:3, :3]) @ model.box_size
         np.testing.assert_allclose(np.asarray(arrays.face_size)[BOX, face], extent, atol=1e-5)
 
@@ -89,7 +89,7 @@ def test_camera_pose_is_the_table_pose_seen_from_the_camera(arrays):
     T = np.eye(4)
     T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
     T[:3, 3] = [0.1, 0.2, 0.7]
-    c = contact(KINDS, FACES, 0.1, -0.2, 0.7)
+    c = placement(KINDS, FACES, 0.1, -0.2, 0.7)
     got = T_camera_object(c, arrays, Table(jnp.asarray(T, jnp.float32), jnp.ones(2)))
     np.testing.assert_allclose(np.asarray(got), T @ np.asarray(T_table_object(c, arrays)), atol=1e-6)
 
@@ -99,8 +99,8 @@ def test_the_prior_integrates_to_one(arrays):
     table = table_of(0.5, 0.4)
     step = 0.0025
     x, y = np.arange(-0.3, 0.3, step) + step / 2, np.arange(-0.3, 0.3, step) + step / 2
-    kind, face, x, y = np.meshgrid(np.arange(8), np.arange(6), x, y, indexing="ij")
-    density = np.exp(np.asarray(log_prior(contact(kind, face, x, y, 1.0), arrays, table), np.float64))
+    type_id, face, x, y = np.meshgrid(np.arange(8), np.arange(6), x, y, indexing="ij")
+    density = np.exp(np.asarray(log_prior(placement(type_id, face, x, y, 1.0), arrays, table), np.float64))
     np.testing.assert_allclose(density.sum() * step**2 * 2 * np.pi, 1, rtol=0.02)  # a cell at the rim counts or not
     per_face = density.sum((2, 3)) * step**2 * 2 * np.pi
     np.testing.assert_allclose(per_face[:5], 1 / 30, rtol=0.05)  # every type and face alike
@@ -110,28 +110,30 @@ def test_the_prior_integrates_to_one(arrays):
 def test_the_prior_is_uniform_inside_and_nothing_outside(arrays, library):
     table, size = table_of(0.5, 0.4), library.models[BOX].box_size
     free = np.array([0.5, 0.4]) - size[[1, 2]]  # face 0 is normal to the box's x
-    inside = contact(BOX, 0, np.array([0, 0.49, -0.49]) * free[0], np.array([0, -0.49, 0.49]) * free[1], [0, 1.0, 6.2])
+    inside = placement(
+        BOX, 0, np.array([0, 0.49, -0.49]) * free[0], np.array([0, -0.49, 0.49]) * free[1], [0, 1.0, 6.2]
+    )
     np.testing.assert_allclose(log_prior(inside, arrays, table), -np.log(30 * free.prod() * 2 * np.pi), rtol=1e-5)
-    outside = contact(BOX, 0, np.array([0.51, 0, -0.51]) * free[0], np.array([0, 0.51, 0.2]) * free[1])
+    outside = placement(BOX, 0, np.array([0.51, 0, -0.51]) * free[0], np.array([0, 0.51, 0.2]) * free[1])
     assert np.isneginf(np.asarray(log_prior(outside, arrays, table))).all()
-    assert np.isneginf(np.asarray(log_prior(contact([-1, 5, 7], 0), arrays, table))).all()
+    assert np.isneginf(np.asarray(log_prior(placement([-1, 5, 7], 0), arrays, table))).all()
 
 
 def test_disjoint_solids_do_not_overlap(arrays):
     rng = np.random.default_rng(0)
     n = 40
-    a = contact(rng.integers(0, 5, n), rng.integers(0, 6, n), 0, 0, rng.uniform(0, 6, n))
-    b = contact(rng.integers(0, 5, n), rng.integers(0, 6, n), 0.16, 0.16, rng.uniform(0, 6, n))
+    a = placement(rng.integers(0, 5, n), rng.integers(0, 6, n), 0, 0, rng.uniform(0, 6, n))
+    b = placement(rng.integers(0, 5, n), rng.integers(0, 6, n), 0.16, 0.16, rng.uniform(0, 6, n))
     assert (np.asarray(overlap(a, b, arrays)) == 0).all()
 
 
 def test_a_solid_overlaps_itself_wholly_and_either_way_alike(arrays):
     rng = np.random.default_rng(1)
-    everything = contact(KINDS, FACES, 0.1, -0.05, 2.0)
+    everything = placement(KINDS, FACES, 0.1, -0.05, 2.0)
     np.testing.assert_allclose(overlap(everything, everything, arrays), 1, atol=0.01)
     n = 60
     a, b = (
-        contact(rng.integers(0, 5, n), rng.integers(0, 6, n), *rng.uniform(-0.04, 0.04, (2, n)), rng.uniform(0, 6, n))
+        placement(rng.integers(0, 5, n), rng.integers(0, 6, n), *rng.uniform(-0.04, 0.04, (2, n)), rng.uniform(0, 6, n))
         for _ in range(2)
     )
     there, back = np.asarray(overlap(a, b, arrays)), np.asarray(overlap(b, a, arrays))
@@ -143,20 +145,20 @@ def test_boxes_side_by_side(arrays):
     """Boxes pushed into one another by a share of their width overlap by that share, of 128 points and whole voxels."""
     size = np.asarray(arrays.face_size)[BOX, 4, 0]
     for share in (0.25, 0.5, 0.75):
-        pushed = contact(BOX, 4, (1 - share) * size)
-        assert abs(float(overlap(contact(BOX, 4), pushed, arrays)) - share) < 0.12
-    gap = contact(BOX, 4, size + 2 * 0.004)
-    assert float(overlap(contact(BOX, 4), gap, arrays)) == 0
+        pushed = placement(BOX, 4, (1 - share) * size)
+        assert abs(float(overlap(placement(BOX, 4), pushed, arrays)) - share) < 0.12
+    gap = placement(BOX, 4, size + 2 * 0.004)
+    assert float(overlap(placement(BOX, 4), gap, arrays)) == 0
 
 
 def test_a_bowl_is_hollow(library):
     """Turned over, it stands above a small cube without touching it; pushed aside, its wall goes through the cube."""
     bowl, cube = library.models[BOWL], model_from_mesh(trimesh.creation.box((0.03,) * 3), "cube", 0.004)
     pair = library_arrays(Library((bowl, cube)))
-    dome = contact(0, int(np.argmax(bowl.contact_normal[:, 2])))
+    dome = placement(0, int(np.argmax(bowl.contact_normal[:, 2])))
     assert float(T_table_object(dome, pair)[2, 2]) < -0.99
     x = np.array([0.0, 0.01, 0.045, 0.12])
-    domes = contact(np.full(4, int(dome.type)), int(dome.face))
-    share = np.asarray(overlap(domes, contact(1, 4, x), pair))
+    domes = placement(np.full(4, int(dome.type)), int(dome.face))
+    share = np.asarray(overlap(domes, placement(1, 4, x), pair))
     np.testing.assert_array_equal(share[[0, 1, 3]], 0)
     assert share[2] > 0.1

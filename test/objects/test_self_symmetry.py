@@ -17,7 +17,7 @@ def of(mesh):
 
 
 def others(found, face):
-    """The contacts told for a face that are not the face itself."""
+    """The placements told for a face that are not the face itself."""
     rows = zip(found.face[face], found.shift[face], strict=True)
     return [(int(f), s) for f, s in rows if f != face or np.abs(s).max() > 0]
 
@@ -37,7 +37,7 @@ def wedge():
     ],
 )
 def test_surfaces_coincide(mesh):
-    """What is told to look alike does: at every contact the surfaces lie within a voxel and a half."""
+    """What is told to look alike does: at every placement the surfaces lie within a voxel and a half."""
     model, T, found = of(mesh)
     points, tree = model.surface_points, cKDTree(model.surface_points)
     told = 0

@@ -23,7 +23,7 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     """Returns that nothing is known of, none at all and far beyond among them; places half of which lie outside of the
     image; places and types that are not searched."""
     rng = np.random.default_rng(seed)
-    image = scene.image(scene.depth(scene.contacts((4, 0.02, -0.03, 0.4))))
+    image = scene.image(scene.depth(scene.placements((4, 0.02, -0.03, 0.4))))
     depth = np.array(image.depth) + rng.normal(0, 0.02, image.depth.shape)
     depth[rng.random(depth.shape) < 0.1] = 0.0
     depth[rng.random(depth.shape) < 0.1] = np.inf

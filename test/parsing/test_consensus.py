@@ -35,9 +35,9 @@ def test_most_of_the_surface_is_found_among_outliers(slope):
 
 
 def test_the_kind_goes_with_the_depth_and_the_lonely_are_unknown():
-    depth, kind = np.full((9, 9), 0.6), np.full((9, 9), IN_WORKSPACE)
-    depth[4, 4], kind[4, 4] = 2.0, BEYOND
-    found, of = consensus(jnp.asarray(depth), jnp.asarray(kind))
+    depth, pixel_class = np.full((9, 9), 0.6), np.full((9, 9), IN_WORKSPACE)
+    depth[4, 4], pixel_class[4, 4] = 2.0, BEYOND
+    found, of = consensus(jnp.asarray(depth), jnp.asarray(pixel_class))
     assert found[4, 4] == pytest.approx(0.6) and of[4, 4] == IN_WORKSPACE
     scattered = 0.3 * 1.1 ** np.arange(25).reshape(5, 5)
     assert (np.asarray(consensus(jnp.asarray(scattered), jnp.ones((5, 5), int))[0]) == 0).all()

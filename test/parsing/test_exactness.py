@@ -11,7 +11,7 @@ import pytest
 from bayes3d_ros.likelihood import density
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Noise, Pixels
 from bayes3d_ros.likelihood.noise import for_image, noise_grid
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import search, smc
 from bayes3d_ros.validation.experiments import exactness
 from bayes3d_ros.validation.experiments.exactness import binned, problem_summary, run, run_marginals
@@ -131,7 +131,7 @@ def test_a_handle_in_sight(seen, seen_exact, seen_sampled, step):
         width, mass = region_against(mixed[name], getattr(truth, name), 0.9)
         assert 0.8 < width < 1.2 and 0.8 < mass < 0.97
     result = run(seen, 0, PARTICLES, step())
-    turn = (result.weight * np.exp(1j * result.contact.yaw[:, 0])).sum()
+    turn = (result.weight * np.exp(1j * result.placement.yaw[:, 0])).sum()
     assert np.degrees(np.sqrt(-2 * np.log(np.abs(turn)))) < 5
     assert np.degrees(np.abs(np.angle(turn * np.exp(-1j * float(seen.truth.yaw[0]))))) < 10
 
@@ -167,7 +167,7 @@ def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
     """Its regions are too wide and its marginals far from the exact ones, whatever the evidence."""
     rng, count = np.random.default_rng(0), 4000
     x, y = (rng.random((2, count)) - 0.5) * np.asarray(seen.table_size)[:, None]
-    anywhere = Contact(np.zeros(count, int), rng.integers(6, size=count), x, y, 2 * np.pi * rng.random(count))
+    anywhere = Placement(np.zeros(count, int), rng.integers(6, size=count), x, y, 2 * np.pi * rng.random(count))
     told = []
     for said in (seen_exact[1], marginals(seen, anywhere, np.ones(count))):
         exact = {
@@ -212,11 +212,11 @@ def integral_over_depth(step=1e-4):
     """Of the likelihood of one pixel over all depths that it may return, given that it does."""
     z = np.arange(0.1, 2, step)
     shape = (1, 4, len(z))  # three pixels beside it, without a return
-    depth, kind = np.ones(shape), np.full(shape, NO_RETURN)
-    depth[0, 0], kind[0, 0] = z, IN_WORKSPACE
+    depth, pixel_class = np.ones(shape), np.full(shape, NO_RETURN)
+    depth[0, 0], pixel_class[0, 0] = z, IN_WORKSPACE
     fill = partial(jnp.full, shape)
     pixels = Pixels(
-        jnp.asarray(depth), jnp.asarray(kind), fill(0.1), fill(-0.2), jnp.float32(0.02), jnp.float32(0.02),
+        jnp.asarray(depth), jnp.asarray(pixel_class), fill(0.1), fill(-0.2), jnp.float32(0.02), jnp.float32(0.02),
         jnp.float32(3 / (2**3 - 0.1**3)), jnp.float32(0.01),
     )  # fmt: skip
     rendered = jnp.broadcast_to(0.5 + 0.02 * jnp.arange(18.0).reshape(3, 6, 1), (3, 6, len(z)))

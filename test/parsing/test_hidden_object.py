@@ -11,7 +11,7 @@ from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
 from bayes3d_ros.objects.library_arrays import NUM_FACES, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.search import Context, conflicts
 
@@ -26,7 +26,7 @@ def behind_a_board(scene, noisy):
     shapes = {"board": trimesh.creation.box((0.20, 0.03, 0.16)), "cube": trimesh.creation.box((0.04, 0.04, 0.04))}
     library = Library(tuple(model_from_mesh(shape, name, 0.005) for name, shape in shapes.items()))
     scene = scene._replace(library=library, arrays=library_arrays(library))
-    board = scene.contacts((4, 0.01, -0.08, 0.1))
+    board = scene.placements((4, 0.01, -0.08, 0.1))
     image = scene.image(noisy(scene.depth(board), 0.002, 0.02, 0))
     return Context(image, scene.arrays, scene.table), scene.table_size, board
 
@@ -34,11 +34,11 @@ def behind_a_board(scene, noisy):
 def from_the_prior(context, count):
     """Draws of one object, as numpy's generator makes them."""
     rng, library = np.random.default_rng(1), context.library
-    kind, face = rng.integers(0, int(library.num_types), count), rng.integers(0, NUM_FACES, count)
-    free = np.asarray(context.table.size) - np.asarray(library.face_size)[kind, face]
+    type_id, face = rng.integers(0, int(library.num_types), count), rng.integers(0, NUM_FACES, count)
+    free = np.asarray(context.table.size) - np.asarray(library.face_size)[type_id, face]
     x, y = ((rng.random((count, 2)) - 0.5) * free).T
     at = (jnp.asarray(a, jnp.float32) for a in (x, y, 2 * np.pi * rng.random(count)))
-    return Contact(jnp.asarray(kind, jnp.int32), jnp.asarray(face, jnp.int32), *at)
+    return Placement(jnp.asarray(type_id, jnp.int32), jnp.asarray(face, jnp.int32), *at)
 
 
 def gains(context, grid, board, empty):
@@ -46,14 +46,16 @@ def gains(context, grid, board, empty):
     it at all."""
     first = jnp.zeros(BLOCK, jnp.int32)
     alone = draw_objects(board, empty.scenes[:1], *context, WINDOW)
-    table = empty.table[:1] + log_likelihood_gain(board, first[:1], empty.scenes[:1], *context, grid.coarse, WINDOW)
+    table = empty.loglik_grid[:1] + log_likelihood_gain(
+        board, first[:1], empty.scenes[:1], *context, grid.coarse, WINDOW
+    )
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (BLOCK, 1)), board)
 
     @jax.jit
-    def of_block(contact):
-        gain = log_likelihood_gain(contact, first, alone, *context, grid.coarse, WINDOW)
-        clash = conflicts(contact, others, jnp.int32(1), context.library, smc.OVERLAP_LIMIT)
-        shown = draw_objects(contact, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
+    def of_block(placement):
+        gain = log_likelihood_gain(placement, first, alone, *context, grid.coarse, WINDOW)
+        clash = conflicts(placement, others, jnp.int32(1), context.library, smc.OVERLAP_LIMIT)
+        shown = draw_objects(placement, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
         value = log_marginal(table + gain, grid) - log_marginal(table, grid)
         return jnp.where(clash, -jnp.inf, value), ~clash & (shown == alone).all((1, 2))
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.mode_search import Hypotheses, factor, log_shares, sharpen
 
 
@@ -39,23 +39,23 @@ def test_factors_of_covariances_that_rounding_made_indefinite():
 def test_sharpening_finds_a_peak_and_its_shape():
     spread, top = np.array([4e-4, 2e-4, 6e-3]), np.array([0.1, -0.05, 0.7])
 
-    def gains(contact):
-        off = jnp.stack([contact.x, contact.y, contact.yaw], -1) - top
+    def gains(placement):
+        off = jnp.stack([placement.x, placement.y, placement.yaw], -1) - top
         return 1e3 - 0.5 * ((off / spread) ** 2).sum(-1)
 
     modes, value = sharpen(jax.random.key(0), _hypotheses(top + 2 * spread), gains, 24, 5)
     assert value[0] > 1e3 - 1
-    np.testing.assert_allclose(np.array([*modes.contact[2:]])[:, 0], top, atol=2e-4)
+    np.testing.assert_allclose(np.array([*modes.placement[2:]])[:, 0], top, atol=2e-4)
     np.testing.assert_allclose(np.diagonal(modes.scale[0] @ modes.scale[0].T) ** 0.5, spread, rtol=0.1)
 
 
 def test_sharpening_a_ridge_without_end_stays_finite():
     """A likelihood that does not change along x and yaw, and one that is the same everywhere."""
 
-    def ridge(contact):
-        return -0.5 * (contact.y / 1e-4) ** 2
+    def ridge(placement):
+        return -0.5 * (placement.y / 1e-4) ** 2
 
-    for gains in (ridge, lambda contact: jnp.zeros_like(contact.x)):
+    for gains in (ridge, lambda placement: jnp.zeros_like(placement.x)):
         modes, value = sharpen(jax.random.key(0), _hypotheses(np.zeros(3)), gains, 24, 12)
         spread = np.linalg.norm(np.asarray(modes.scale[0]), axis=1)
         assert np.isfinite(modes.scale).all() and np.isfinite(value).all()
@@ -64,5 +64,5 @@ def test_sharpening_a_ridge_without_end_stays_finite():
 
 def _hypotheses(at):
     zero = jnp.zeros(1, jnp.int32)
-    contact = Contact(zero, zero, *(jnp.array([v], jnp.float32) for v in at))
-    return Hypotheses(contact, jnp.diag(jnp.array([5e-4, 5e-4, 1e-2]))[None])
+    placement = Placement(zero, zero, *(jnp.array([v], jnp.float32) for v in at))
+    return Hypotheses(placement, jnp.diag(jnp.array([5e-4, 5e-4, 1e-2]))[None])

@@ -10,7 +10,7 @@ from scipy import stats
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact, Table, log_prior
+from bayes3d_ros.objects.placement import Placement, Table, log_prior
 from bayes3d_ros.parsing.coarse_search import CELL
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose, wrap
 
@@ -33,10 +33,10 @@ def table():
     return Table(jnp.eye(4), jnp.array(SIZE))
 
 
-def contacts(kind, face, x, y, yaw):
-    kind, face, x, y, yaw = np.broadcast_arrays(kind, face, x, y, yaw)
-    return Contact(
-        *(jnp.asarray(a.ravel(), jnp.int32) for a in (kind, face)),
+def placements(type_id, face, x, y, yaw):
+    type_id, face, x, y, yaw = np.broadcast_arrays(type_id, face, x, y, yaw)
+    return Placement(
+        *(jnp.asarray(a.ravel(), jnp.int32) for a in (type_id, face)),
         *(jnp.asarray(a.ravel(), jnp.float32) for a in (x, y, yaw)),
     )
 
@@ -46,7 +46,7 @@ def proposal(shares=(0.6, 0.3, 0.1), yaw_scale=0.3):
     rng = np.random.default_rng(0)
     scale = np.diag([0.02, 0.015, yaw_scale]) @ np.tril([[1, 0, 0], [0.5, 1, 0], [-0.4, 0.3, 1]])
     modes = Modes(
-        contacts([0, 0, 1], [4, 4, 2], [0.05, 0.06, -0.1], [0.02, 0.0, 0.1], [6.2, 5.9, 3.0]),
+        placements([0, 0, 1], [4, 4, 2], [0.05, 0.06, -0.1], [0.02, 0.0, 0.1], [6.2, 5.9, 3.0]),
         jnp.asarray(np.stack([scale, 1.5 * scale, 0.7 * scale]), jnp.float32),
         jnp.log(jnp.array([0.5, 0.2, 0.3])),
     )
@@ -63,8 +63,8 @@ def test_integrates_to_one(arrays, table, shares, start):
     x = np.arange(-0.5, 0.5, step) + step / 2
     yaw = start + 2 * np.pi * np.arange(turns) / turns
     total = 0.0
-    for kind, face in np.ndindex(KINDS, FACES):
-        at = contacts(kind, face, x[:, None, None], x[:, None], yaw)
+    for type_id, face in np.ndindex(KINDS, FACES):
+        at = placements(type_id, face, x[:, None, None], x[:, None], yaw)
         total += np.exp(np.asarray(density(at, proposal(shares), arrays, table), np.float64)).sum()
     assert total * step**2 * 2 * np.pi / turns == pytest.approx(1, abs=0.01)
 
@@ -74,11 +74,11 @@ def test_wraps_around_the_circle(arrays, table, yaw_scale):
     """The yaw of a mode, given its place, integrates to its mass there however wide it is; turns do not change it."""
     p = proposal((1.0, 0.0, 0.0), yaw_scale)
     # Off every mode's type and face there is nothing, a turn on there is the same.
-    assert np.isneginf(np.asarray(density(contacts(1, 4, 0.05, 0.02, [0.0, 3.0]), p, arrays, table))).all()
+    assert np.isneginf(np.asarray(density(placements(1, 4, 0.05, 0.02, [0.0, 3.0]), p, arrays, table))).all()
     yaw = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
-    value = np.asarray(density(contacts(0, 4, 0.05, 0.02, yaw), p, arrays, table), np.float64)
+    value = np.asarray(density(placements(0, 4, 0.05, 0.02, yaw), p, arrays, table), np.float64)
     for turn in (-2 * np.pi, 2 * np.pi):
-        again = np.asarray(density(contacts(0, 4, 0.05, 0.02, yaw + turn), p, arrays, table))
+        again = np.asarray(density(placements(0, 4, 0.05, 0.02, yaw + turn), p, arrays, table))
         np.testing.assert_allclose(again, value, atol=2e-4 / yaw_scale)
     # In closed form: a multivariate t's marginal over the first two of its coordinates.
     expected = 0.0
@@ -104,13 +104,13 @@ def test_floors(arrays, table):
     i, j = np.indices(SHAPE)
     middle = (np.stack([i, j], -1) + 0.5) * CELL - np.array(SIZE) / 2
     hidden = np.asarray(
-        density(contacts(1, 3, middle[..., 0], middle[..., 1], 1.0), proposal((0, 1, 0)), arrays, table)
+        density(placements(1, 3, middle[..., 0], middle[..., 1], 1.0), proposal((0, 1, 0)), arrays, table)
     )
     with np.errstate(divide="ignore"):
         np.testing.assert_allclose(hidden, (np.log(cells / CELL**2) - discrete).ravel(), atol=1e-4)
     rng = np.random.default_rng(0)
     n = 500
-    at = contacts(rng.integers(0, KINDS, n), rng.integers(0, FACES, n), *rng.uniform(-0.25, 0.25, (2, n)), 1.0)
+    at = placements(rng.integers(0, KINDS, n), rng.integers(0, FACES, n), *rng.uniform(-0.25, 0.25, (2, n)), 1.0)
     anywhere = np.asarray(density(at, proposal((0, 0, 1)), arrays, table))
     prior = np.asarray(log_prior(at, arrays, table))
     assert 100 < np.isfinite(prior).sum() < 400
@@ -169,8 +169,8 @@ def test_draws_follow_the_density(drawn, arrays, table):
         (1, 2, -0.1, 0.1, 3.1, 0.02),
         (1, 5, 0.0, 0.0, 0.0, 0.06),
     ]
-    for kind, face, x0, y0, yaw0, width in places:
-        here = (np.asarray(drawn.type) == kind) & (np.asarray(drawn.face) == face)
+    for type_id, face, x0, y0, yaw0, width in places:
+        here = (np.asarray(drawn.type) == type_id) & (np.asarray(drawn.face) == face)
         bump = stats.norm.pdf(x, x0, width) * stats.norm.pdf(y, y0, width) * stats.vonmises.pdf(yaw, 2.0, yaw0)
         value = np.where(here, bump, 0) * np.exp(-log_q)
         error = value.std() / np.sqrt(COUNT)

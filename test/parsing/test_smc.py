@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.noise import log_marginal, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene
-from bayes3d_ros.objects.placement import Contact, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.search import Context
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth
@@ -50,18 +50,18 @@ def enumerate_evidence(context, grid, empty):
     size = 1024
 
     @jax.jit
-    def log_integrand(contact):
-        nobody = jnp.zeros(contact.type.shape, jnp.int32)
-        gain = log_likelihood_gain(contact, nobody, empty.scenes[:1], *context, grid.coarse, WINDOW)
-        value = log_marginal(empty.table[:1] + gain, grid) - empty.log_likelihood[0]
-        return value + log_prior(contact, context.library, context.table)
+    def log_integrand(placement):
+        nobody = jnp.zeros(placement.type.shape, jnp.int32)
+        gain = log_likelihood_gain(placement, nobody, empty.scenes[:1], *context, grid.coarse, WINDOW)
+        value = log_marginal(empty.loglik_grid[:1] + gain, grid) - empty.log_likelihood[0]
+        return value + log_prior(placement, context.library, context.table)
 
     def evaluate(cells):
         values = []
         for i in range(0, len(cells), size):
             face, x, y, yaw = np.resize(cells[i : i + size], (size, 4)).T
-            kind = jnp.zeros(size, jnp.int32)
-            at = Contact(kind, jnp.asarray(face, jnp.int32), *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
+            type_id = jnp.zeros(size, jnp.int32)
+            at = Placement(type_id, jnp.asarray(face, jnp.int32), *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
             values.append(np.asarray(log_integrand(at), np.float64)[: len(cells) - i])
         return np.concatenate(values)
 
@@ -86,7 +86,7 @@ def enumerate_evidence(context, grid, empty):
 
 def test_evidence_of_one_object(scene, grid, noisy):
     """The mean of Z_hat over seeds is Z, found by enumeration. The box looks the same in four contacts: four modes."""
-    truth = scene.contacts((4, 0.02, -0.03, 0.6))
+    truth = scene.placements((4, 0.02, -0.03, 0.6))
     context = Context(scene.image(noisy(scene.depth(truth), 0.003, 0.05, 0)), scene.arrays, scene.table)
     empty = start(context, grid, scene)
     estimates = [
@@ -104,7 +104,7 @@ def pair(scene, grid, noisy):
     exact = known(grid, 0.003, 0.05)
     near, far = (4, -0.08, -0.07, 0.5), (4, 0.09, 0.08, 1.3)
     return exact, [
-        Context(scene.image(noisy(scene.depth(scene.contacts(*rows)), 0.003, 0.05, 1)), scene.arrays, scene.table)
+        Context(scene.image(noisy(scene.depth(scene.placements(*rows)), 0.003, 0.05, 1)), scene.arrays, scene.table)
         for rows in ((near,), (far,), (near, far))
     ]
 
@@ -154,7 +154,7 @@ def test_a_third_object_is_not_worth_its_room(scene, pair):
                 assert (np.asarray(overlap(mine, theirs, scene.arrays))[some] <= smc.OVERLAP_LIMIT).all()
         # The tables that were summed gain by gain are those of the scenes drawn, up to one constant.
         whole = np.asarray(log_likelihood_scene(state.scenes[:8], context.image, grid.coarse, WINDOW))
-        constant = whole - np.asarray(state.table[:8])
+        constant = whole - np.asarray(state.loglik_grid[:8])
         np.testing.assert_allclose(constant, constant[0, 0, 0], atol=0.1)
     share = np.exp(np.array(evidence) + np.arange(4) * np.log(0.1) - evidence[2])
     assert share[2] / share.sum() > 0.95
@@ -173,12 +173,16 @@ def test_a_key_decides_all(scene, pair):
 @pytest.mark.parametrize("sigma", [0.0008, 0.002, 0.004])
 def test_the_noise_of_an_image_is_covered(scene, grid, sigma, p_outlier):
     """The sigma and p_outlier that an image was drawn with lie in their posteriors, which are narrow."""
-    clean, rays, limits = scene.depth(scene.contacts((4, 0.02, -0.03, 0.6))), scene.camera.rays(), DepthRange(0.1, 5.0)
+    clean, rays, limits = (
+        scene.depth(scene.placements((4, 0.02, -0.03, 0.6))),
+        scene.camera.rays(),
+        DepthRange(0.1, 5.0),
+    )
     rng = np.random.default_rng(7)
     depth = draw_depth(rng, clean, rays[0, :, 0], rays[:, 0, 1], (sigma, p_outlier), limits, WINDOW)
     context = Context(scene.image(depth), scene.arrays, scene.table)
     state, _ = step(jax.random.key(0), start(context, grid, scene), 0, context, grid, scene)
-    found = jax.jit(sample)(jax.random.key(1), state.table, grid)
+    found = jax.jit(sample)(jax.random.key(1), state.loglik_grid, grid)
     weight = np.exp(np.asarray(state.log_weight, float))
     for values, truth, widest in ((found.sigma, sigma, 0.15 * sigma), (found.p_outlier, p_outlier, 0.1)):
         order = np.argsort(values)

@@ -15,11 +15,11 @@ WINDOW = 3
 @pytest.fixture(scope="module")
 def look(scene):
     """covariance(error, row, hidden=False) of a box that stands alone, or behind a wall."""
-    nothing = np.zeros_like(scene.depth(scene.contacts((4, 0.0, 0.0, 0.3))))
+    nothing = np.zeros_like(scene.depth(scene.placements((4, 0.0, 0.0, 0.3))))
     compute = jax.jit(offset_covariance, static_argnames="window")
 
     def covariance(bias, waviness, row=(4, 0.02, -0.03, 0.6), hidden=False):
-        objects = scene.contacts(row)
+        objects = scene.placements(row)
         depth = scene.depth(objects)
         context = Context(scene.image(depth), scene.arrays, scene.table)
         shown = pad_scene(jnp.asarray(nothing + 0.1 if hidden else depth, jnp.float32), WINDOW)
@@ -63,7 +63,7 @@ def test_what_is_hidden_is_not_moved_by_its_picture(look):
 
 
 def test_draws_have_that_covariance(scene):
-    objects = scene.contacts((4, 0.02, -0.03, 0.6))
+    objects = scene.placements((4, 0.02, -0.03, 0.6))
     depth = scene.depth(objects)
     context = Context(scene.image(depth), scene.arrays, scene.table)
     count = 1500

@@ -54,11 +54,11 @@ def test_workspace_tells_the_table_what_stands_on_it_and_what_is_beyond():
     depth[:, :5] = np.nan
     points = unproject(depth, CAMERA)
     T = table_frame(find_plane(points[np.isfinite(depth)]), points[np.isfinite(depth)])
-    kind = workspace(points, T, (1.2, 1.2), 0.5)
-    assert (kind[50:70, 73:87] == IN_WORKSPACE).all()  # the cube
-    assert (kind[100:, 20:140] == IN_WORKSPACE).mean() > 0.99  # the table
-    assert (kind[:3, 20:140] == BEYOND).all()  # the wall
-    assert (kind[:, :5] == NO_RETURN).all()
+    pixel_class = workspace(points, T, (1.2, 1.2), 0.5)
+    assert (pixel_class[50:70, 73:87] == IN_WORKSPACE).all()  # the cube
+    assert (pixel_class[100:, 20:140] == IN_WORKSPACE).mean() > 0.99  # the table
+    assert (pixel_class[:3, 20:140] == BEYOND).all()  # the wall
+    assert (pixel_class[:, :5] == NO_RETURN).all()
 
 
 def test_thing_that_stands_beside_the_table_is_not_on_it():
@@ -68,8 +68,8 @@ def test_thing_that_stands_beside_the_table_is_not_on_it():
     depth[edge - 25 : edge, 30:60] = 1.25
     points = unproject(depth, CAMERA)
     T = table_frame(find_plane(points[np.isfinite(depth)]), points[np.isfinite(depth)])
-    kind = workspace(points, T, (1.2, 1.2), 0.5)
-    assert (kind[edge - 20 : edge - 5, 35:55] == BEYOND).all()
+    pixel_class = workspace(points, T, (1.2, 1.2), 0.5)
+    assert (pixel_class[edge - 20 : edge - 5, 35:55] == BEYOND).all()
 
 
 @pytest.mark.parametrize(
@@ -96,12 +96,12 @@ def test_the_share_of_usable_pixels_is_of_those_that_look_at_the_table():
     on_table = np.zeros(depth.shape, bool)
     on_table[np.isfinite(bare)] = (np.abs(local) < [0.2, 0.15]).all(-1)
     assert 500 < on_table.sum() < 0.5 * depth.size
-    kind = np.where(on_table, IN_WORKSPACE, NO_RETURN)
-    assert usable_share(kind, rays, T, size, 5.0) == 1.0
+    pixel_class = np.where(on_table, IN_WORKSPACE, NO_RETURN)
+    assert usable_share(pixel_class, rays, T, size, 5.0) == 1.0
     row, column = np.nonzero(on_table)
-    kind[row[::4], column[::4]] = NO_RETURN
-    kind[row[1::4], column[1::4]] = BEYOND  # says that nothing is in between
-    assert usable_share(kind, rays, T, size, 5.0) == pytest.approx(0.75, abs=1e-3)
+    pixel_class[row[::4], column[::4]] = NO_RETURN
+    pixel_class[row[1::4], column[1::4]] = BEYOND  # says that nothing is in between
+    assert usable_share(pixel_class, rays, T, size, 5.0) == pytest.approx(0.75, abs=1e-3)
     looks_up = np.diag([1.0, -1.0, -1.0, 1.0])  # the table above the camera, seen from below
     looks_up[1, 3] = -1.0
-    assert np.isnan(usable_share(kind, rays, looks_up, size, 5.0))
+    assert np.isnan(usable_share(pixel_class, rays, looks_up, size, 5.0))

@@ -13,7 +13,7 @@ from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.likelihood.camera_score import World, depth_along, log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE
 from bayes3d_ros.likelihood.noise import for_returns, log_marginal, noise_grid
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
@@ -31,7 +31,7 @@ def scene():
     base = trimesh.creation.box((0.16, 0.10, 0.06))
     tower = trimesh.creation.box((0.05, 0.06, 0.12)).apply_translation((-0.04, 0.01, 0.06))
     arrays = library_arrays(Library((model_from_mesh(trimesh.util.concatenate([base, tower]), "thing", 0.006),)))
-    return tracking.Scene(World(jnp.array([0]), jnp.eye(4)[None], jnp.asarray(False)), arrays, jnp.zeros(3))
+    return tracking.TrackedScene(World(jnp.array([0]), jnp.eye(4)[None], jnp.asarray(False)), arrays, jnp.zeros(3))
 
 
 def looking(azimuth, distance=0.5):
@@ -50,14 +50,14 @@ def image_from(T, scene, sigma, rng):
     depth = np.asarray(_render(jnp.float32(T), scene.world, scene.library, rays))
     there = np.isfinite(depth)
     noisy = depth + sigma * rng.normal(size=depth.shape)
-    return Image(
+    return ScoredImage(
         depth=jnp.float32(np.where(there, noisy, 1.5)),
-        kind=jnp.asarray(np.where(there, IN_WORKSPACE, BEYOND), jnp.int32),
+        pixel_class=jnp.asarray(np.where(there, IN_WORKSPACE, BEYOND), jnp.int32),
         ray_x=jnp.float32(ray),
         ray_y=jnp.float32(ray),
         focal=jnp.full(2, FOCAL, jnp.float32),
         centre=jnp.full(2, CENTRE, jnp.float32),
-        table=jnp.full((SIZE, SIZE), jnp.inf),
+        bare_depth=jnp.full((SIZE, SIZE), jnp.inf),
         outlier_scale=jnp.float32(3 / (FAR**3 - 0.1**3)),
         front_margin=jnp.float32(0.015),
     )
@@ -112,7 +112,7 @@ def test_evidence_is_that_of_plain_monte_carlo(scene):
     """With noise so large that draws of the predictive alone can be summed, the mean over runs is the same."""
     truth, grid = looking(0.4), noise_grid(0.06)
     image = image_from(truth, scene, 0.03, np.random.default_rng(0))
-    grid = for_returns(grid, image.kind)
+    grid = for_returns(grid, image.pixel_class)
     motion = tracking.Motion(jnp.float32(0.006), jnp.float32(0.02))
     before = np.asarray(se3.exp_about(jnp.array([0.004, -0.003, 0.004, 0.01, -0.01, 0.01]), jnp.zeros(3))) @ truth
     _, own = tracking.shares(HYPOTHESES)
@@ -150,7 +150,7 @@ def test_a_camera_is_followed_and_its_covariance_holds(scene):
     for k, truth in enumerate(poses):
         image = image_from(truth, scene, 0.002, rng)
         state, info = tracking.step(
-            jax.random.key(k), state, image, scene, for_returns(grid, image.kind), motion, HYPOTHESES, WINDOW
+            jax.random.key(k), state, image, scene, for_returns(grid, image.pixel_class), motion, HYPOTHESES, WINDOW
         )
         compiled = compiled or tracking.step._cache_size()
         change = se3.product(jnp.asarray(truth, jnp.float32), se3.inverse(info.T_camera_world))

@@ -241,7 +241,7 @@ def test_draws_over_a_table_see_it_as_it_was_seen(altitude):
 
 def test_a_camera_is_looked_for_without_a_table(tracker, world):
     """What returns is the object's; only the paper's prior tells how near and how high."""
-    alone, there = replace(world, table=False), looking(2.2, 0.6)
+    alone, there = replace(world, table_visible=False), looking(2.2, 0.6)
     there[:3, :3] = there[:3, :3] @ Rotation.from_euler("xyz", [0.05, -0.1, 0.02]).as_matrix()
     scene = World(jnp.array([0]), jnp.asarray(alone.T_world_object, jnp.float32), jnp.asarray(False))
     rays = CAMERA.rays()

@@ -16,7 +16,7 @@ def test_a_world_is_read(tmp_path):
     file = tmp_path / "world.yaml"
     file.write_text(f"objects:\n- {MUG}\n- {MUG.replace('mug', 'box')}\n")
     world = load_world(file, True, LIBRARY)
-    assert world.types == ("mug", "box") and world.table
+    assert world.types == ("mug", "box") and world.table_visible
     expected = [[-1, 0, 0, 0.1], [0, -1, 0, -0.2], [0, 0, 1, 0.03], [0, 0, 0, 1]]
     np.testing.assert_allclose(world.T_world_object[0], expected)
 

@@ -11,7 +11,7 @@ import pytest
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.noise import for_image
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.search import Context
 from bayes3d_ros.validation.experiments import calibration, calibration_points
@@ -89,7 +89,7 @@ def test_splines_in_sigma_are_as_good_as_many_sigmas(problem):
     """Of empty tables: log likelihoods at 200 sigmas about the truth against those of the grid, given p_outlier. What
     splines alone make of them is off by a third of a standard deviation (root mean square)."""
     window, off = problem.settings.window, []
-    bare = np.asarray(problem.blank.table)
+    bare = np.asarray(problem.blank.bare_depth)
     scenes = pad_scene(jnp.asarray(bare)[None], window)
     for k in range(12):
         rng = np.random.default_rng((100, k))
@@ -140,7 +140,7 @@ def made_up(wrong_yaw=0.0, scenes=300):
         def slots(draw):
             return draw((41, 2)).astype(np.float32)
 
-        objects = Contact(
+        objects = Placement(
             rng.integers(0, 2, (41, 2)),
             rng.integers(0, 6, (41, 2)),
             slots(rng.standard_normal),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood.density import NO_RETURN
-from bayes3d_ros.objects.placement import Contact, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.smc import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference import exact_reference
 from bayes3d_ros.validation.reference.exact_pairs import close_to, heaviest, true_places
@@ -45,8 +45,8 @@ def blocks():
 
 def prior_mass(problem):
     """Of all cells together."""
-    contact, width = all_cells(problem)
-    density = np.exp(np.asarray(log_prior(Contact(*map(jnp.asarray, contact)), *problem.context[1:]), np.float64))
+    placement, width = all_cells(problem)
+    density = np.exp(np.asarray(log_prior(Placement(*map(jnp.asarray, placement)), *problem.context[1:]), np.float64))
     return (density * width.prod(1)).sum()
 
 
@@ -75,7 +75,9 @@ def test_an_angle_enumerated_twice_is_caught(monkeypatch, mug, planted):
 def test_an_image_that_says_nothing_leaves_the_prior(mug):
     """Nothing returned: Z_1 = Z_0, and every yaw and face is as likely as any."""
     image = mug.context.image
-    blind = mug._replace(context=mug.context._replace(image=image._replace(kind=jnp.full_like(image.kind, NO_RETURN))))
+    blind = mug._replace(
+        context=mug.context._replace(image=image._replace(pixel_class=jnp.full_like(image.pixel_class, NO_RETURN)))
+    )
     found = enumerate_object(blind, levels=(), cell=0.03)
     assert found.log_evidence[-1] == pytest.approx(0, abs=1e-4)
     said = found.marginals(blind)
@@ -91,8 +93,8 @@ def found(mug):
 
 def test_halving_cells_keeps_their_volume(mug, found):
     inside = close_to(*true_places(mug)[0])
-    contact, width = all_cells(mug)
-    assert found.cells.width.prod(1).sum() == pytest.approx(width[inside(contact)].prod(1).sum(), rel=1e-9)
+    placement, width = all_cells(mug)
+    assert found.cells.width.prod(1).sum() == pytest.approx(width[inside(placement)].prod(1).sum(), rel=1e-9)
 
 
 def test_evidence_converges(mug, found):
@@ -108,7 +110,7 @@ def test_objects_far_apart_explain_the_image_apart(blocks):
     some = []
     for place in true_places(blocks):
         cells = heaviest(enumerate_object(blocks, scene, FEW[:3], close_to(*place)).cells)
-        some.append(take(cells.contact, rng.choice(len(cells.log_value), 64)))
+        some.append(take(cells.placement, rng.choice(len(cells.log_value), 64)))
     alone = all_gains(blocks, scene, some[1])
     for k in range(3):
         beside = with_object(blocks, take(some[0], [k]))

@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Likelihood, Pixels, inlier_density, outlier_density
 from bayes3d_ros.likelihood.noise import NoiseGrid, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.placement import log_prior, overlap
 from bayes3d_ros.parsing.smc import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference.calibration_problem import small_problem
@@ -49,7 +49,7 @@ def cumulative(sigma, p_outlier):
             shape = (1, 1, len(z))
             pixels = Pixels(
                 depth=jnp.asarray(z, jnp.float32).reshape(shape),
-                kind=jnp.full(shape, IN_WORKSPACE),
+                pixel_class=jnp.full(shape, IN_WORKSPACE),
                 ray_x=jnp.full(shape, RAY_X[u], jnp.float32),
                 ray_y=jnp.full(shape, RAY_Y[v], jnp.float32),
                 step_x=jnp.float32(1 / FOCAL),
@@ -142,7 +142,7 @@ def test_noise_is_of_the_prior_that_is_integrated(problem):
 class Cloud(NamedTuple):
     """A scene with holes, and how free points of it are scored."""
 
-    image: Image
+    image: ScoredImage
     surface: np.ndarray
     grid: NoiseGrid
 
@@ -156,14 +156,14 @@ def cloud():
     depth[6:12, 8:14] -= 0.06
     depth[:, 16:] = np.inf
     x, y = (np.arange(width) - 11.5) / focal, (np.arange(height) - 8.5) / focal
-    blank = Image(
+    blank = ScoredImage(
         depth=jnp.zeros(depth.shape),
-        kind=jnp.full(depth.shape, IN_WORKSPACE),
+        pixel_class=jnp.full(depth.shape, IN_WORKSPACE),
         ray_x=jnp.asarray(x, jnp.float32),
         ray_y=jnp.asarray(y, jnp.float32),
         focal=jnp.full(2, focal),
         centre=jnp.array([11.5, 8.5]),
-        table=jnp.asarray(depth, jnp.float32),
+        bare_depth=jnp.asarray(depth, jnp.float32),
         outlier_scale=jnp.float32(LIMITS.outlier_scale),
         front_margin=jnp.float32(0.01),
         likelihood=Likelihood("points"),
@@ -181,7 +181,7 @@ def noise_ranks(cloud, scenes, error=1.0, scored=None):
         sigma, p_outlier = draw_noise(rng, cloud.grid)
         rays = np.asarray(cloud.image.ray_x), np.asarray(cloud.image.ray_y)
         points = draw_points(rng, cloud.surface, *rays, (error * sigma, p_outlier), LIMITS)
-        assert int((points.kind != NO_RETURN).sum()) == cloud.surface.size
+        assert int((points.pixel_class != NO_RETURN).sum()) == cloud.surface.size
         drawn = draw(jax.random.key(k), table_of(scene, cloud.image._replace(points=points), cloud.grid.coarse, WINDOW))
         equal = np.full(samples, 1 / samples)
         ranks.append(

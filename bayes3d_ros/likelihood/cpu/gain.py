@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.cpu import loops
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 _NEGLIGIBLE = 14.0  # nats below the outliers' density: one in a million
@@ -18,7 +18,7 @@ _NEGLIGIBLE = 14.0  # nats below the outliers' density: one in a million
 
 @partial(jax.jit, static_argnames="window")
 def compiled_gain(
-    drawn: Drawn, scenes: Scenes | None, image: Image, library: LibraryArrays, noise: Noise, window: int
+    drawn: Drawn, scenes: SceneDepths | None, image: ScoredImage, library: LibraryArrays, noise: Noise, window: int
 ) -> Float[Array, "N S P"]:
     """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
     without scenes, nothing is there before."""
@@ -27,7 +27,7 @@ def compiled_gain(
     inputs = (
         *_things(drawn, library),
         _real(image.depth),
-        _whole(image.kind),
+        _whole(image.pixel_class),
         _real(image.ray_x),
         _real(image.ray_y),
         _real([*numbers, *_reach(image, noise, window)]),
@@ -42,7 +42,7 @@ def compiled_gain(
 
 @partial(jax.jit, static_argnames="border")
 def compiled_depth(
-    drawn: Drawn, start: Float[Array, "N Hp Wp"] | None, image: Image, library: LibraryArrays, border: int = 0
+    drawn: Drawn, start: Float[Array, "N Hp Wp"] | None, image: ScoredImage, library: LibraryArrays, border: int = 0
 ) -> Float[Array, "N Hp Wp"]:
     """Depth of what is drawn where it is nearer than what there is to start with, inf where nothing is. Images to start
     with have so many pixels before the camera's first row and column, and any number after the last."""
@@ -86,10 +86,10 @@ def _real(numbers: Array | Sequence) -> Float[Array, "n"]:
     return jnp.asarray(numbers, jnp.float32).ravel()
 
 
-def _reach(image: Image, noise: Noise, window: int) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _reach(image: ScoredImage, noise: Noise, window: int) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How much nearer or farther than a surface, in metres and as a share of its depth, a return may be for its
     window's density to count beside the outliers'."""
-    least = jnp.where(image.kind == IN_WORKSPACE, image.depth, jnp.inf).min()
+    least = jnp.where(image.pixel_class == IN_WORKSPACE, image.depth, jnp.inf).min()
     peak = 1 / (jnp.sqrt(2 * jnp.pi) * noise.sigma.min() * image.outlier_scale * least**2)
     odds = (1 - noise.p_outlier.min()) / jnp.maximum(noise.p_outlier.min(), 1e-12)
     nats = _NEGLIGIBLE + jnp.log1p(odds * peak)

@@ -80,7 +80,7 @@ class Met(NamedTuple):
     pixel: Int[np.ndarray, "L"]
 
 
-class Grid(NamedTuple):
+class VoxelWords(NamedTuple):
     """A voxel grid and a camera: where its words begin, how many an octant has, its size, and where the eye is, in
     voxels."""
 
@@ -382,7 +382,7 @@ class Things(NamedTuple):
     dims: Int[np.ndarray, "T*3"]
     origin: Float[np.ndarray, "T*3"]
     size: Float[np.ndarray, "T"]
-    kind: Int[np.ndarray, "N*K"]
+    type_id: Int[np.ndarray, "N*K"]
     hull_corner: Float[np.ndarray, "T*3*C"]
     hull_count: Int[np.ndarray, "T"]
     pose: Float[np.ndarray, "N*K*12"]
@@ -393,7 +393,7 @@ class Picture(NamedTuple):
     the first, and of which `ray_y` tells the number."""
 
     depth: Float[np.ndarray, "H*W"]
-    kind: Int[np.ndarray, "H*W"]
+    pixel_class: Int[np.ndarray, "H*W"]
     ray_x: Float[np.ndarray, "W"]
     ray_y: Float[np.ndarray, "H"]
     focal_x: float
@@ -420,7 +420,7 @@ class Space(NamedTuple):
     patch: Float[np.ndarray, "I"]  # depth of the hypothesis, _NOTHING where there is no surface
     before: Float[np.ndarray, "I"]  # of its scene
     depth: Float[np.ndarray, "I"]  # observed
-    kind: Int[np.ndarray, "I"]
+    pixel_class: Int[np.ndarray, "I"]
     changed: Int[np.ndarray, "I"]  # pixels that the hypothesis changes
     seen: Int[np.ndarray, "I"]  # pixels in whose windows there are such pixels
     wider: Int[np.ndarray, "I"]  # those by rows
@@ -587,8 +587,13 @@ def _eye(pose, origin, axis):
 @_within
 def _draw_object(things, thing, k, picture, patch, stride, shift, space):
     """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
-    kind, pose, turn, lanes = things.kind[thing], things.pose[12 * thing : 12 * thing + 12], space.turn, space.lanes
-    origin, dims = things.origin[3 * kind : 3 * kind + 3], things.dims[3 * kind : 3 * kind + 3]
+    type_id, pose, turn, lanes = (
+        things.type_id[thing],
+        things.pose[12 * thing : 12 * thing + 12],
+        space.turn,
+        space.lanes,
+    )
+    origin, dims = things.origin[3 * type_id : 3 * type_id + 3], things.dims[3 * type_id : 3 * type_id + 3]
     u0, u1, v0, v1 = space.box[4 * k], space.box[4 * k + 1], space.box[4 * k + 2], space.box[4 * k + 3]
     if u1 <= u0:
         return
@@ -603,12 +608,12 @@ def _draw_object(things, thing, k, picture, patch, stride, shift, space):
             space.left,
             space.right,
         )
-    scale = f32(1.0) / things.size[kind]
+    scale = f32(1.0) / things.size[type_id]
     for axis in range(3):
         for row in range(3):
             turn[3 * row + axis] = pose[4 * row + axis] * scale
-    grid = Grid(
-        things.first[kind],
+    grid = VoxelWords(
+        things.first[type_id],
         i32(dims[0] * dims[1] * dims[2]),
         f32(dims[0]),
         f32(dims[1]),
@@ -656,13 +661,13 @@ def _copy_scene(scenes, scene_at, count, before, patch, at):
 
 
 @_within
-def _copy_returns(picture, pixel, count, depth, kind, at):
+def _copy_returns(picture, pixel, count, depth, pixel_class, at):
     """A row of the observed image."""
-    every_depth, every_kind = picture.depth, picture.kind
+    every_depth, every_class = picture.depth, picture.pixel_class
     pixel, at = u64(pixel), u64(at)
     for k in range(u64(count)):
         depth[at + k] = every_depth[pixel + k]
-        kind[at + k] = every_kind[pixel + k]
+        pixel_class[at + k] = every_class[pixel + k]
 
 
 @_lanes
@@ -713,9 +718,9 @@ def _either(flags, first, last, step, border, found):
 def _sort(space, first, last, low, high, front_margin):
     """Pixels that the hypothesis changes: how many have windows to be looked at (`close`), how many are too far from
     every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
-    depth, kind, seen, patch, before, close = (
+    depth, pixel_class, seen, patch, before, close = (
         space.depth,
-        space.kind,
+        space.pixel_class,
         space.seen,
         space.patch,
         space.before,
@@ -723,7 +728,7 @@ def _sort(space, first, last, low, high, front_margin):
     )
     near, count, hidden = i32(0), i32(0), i32(0)
     for k in range(u64(first), u64(last)):
-        z, sort = depth[k], kind[k]
+        z, sort = depth[k], pixel_class[k]
         counts = (seen[k] != u8(0)) & (sort == i32(IN_WORKSPACE))
         looked = counts & (z > low) & (z < high)
         close[k] = u8(looked)
@@ -908,11 +913,11 @@ def _outlines(things, n, objects, picture, space):
     u0, u1, v0, v1, corners = len(picture.ray_x), 0, len(picture.ray_y), 0, _most_corners(things)
     for k in range(objects):
         thing = n * objects + k
-        kind = things.kind[thing]
+        type_id = things.type_id[thing]
         box, space.behind[k] = _outline(
             things.pose[12 * thing : 12 * thing + 12],
-            things.hull_corner[3 * corners * kind : 3 * corners * (kind + 1)],
-            _whole_vectors(things.hull_count[kind]),
+            things.hull_corner[3 * corners * type_id : 3 * corners * (type_id + 1)],
+            _whole_vectors(things.hull_count[type_id]),
             picture,
             k,
             space,
@@ -958,10 +963,10 @@ def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
             )
     else:
         _fill(space.patch, size, f32(_NOTHING))
-    _fill(space.kind, size, i32(0))
+    _fill(space.pixel_class, size, i32(0))
     for v in range(top, bottom):
         at = (v - top + border) * stride + border
-        _copy_returns(picture, v * width + left, right - left, space.depth, space.kind, at)
+        _copy_returns(picture, v * width + left, right - left, space.depth, space.pixel_class, at)
     return stride, size, left - border, top - border
 
 
@@ -1040,7 +1045,7 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
 @_whole
 def _objects(things, planes):
     """How many objects a hypothesis has; every hypothesis has one plane."""
-    return len(things.kind) // max(len(planes) // 4, 1)
+    return len(things.type_id) // max(len(planes) // 4, 1)
 
 
 @_whole
@@ -1095,7 +1100,7 @@ def _depth(frame):
     things, planes = _things(frame), floats(frame, 9)
     numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
-        start, things.kind, floats(frame, 10), floats(frame, 11)[: shape[4]],
+        start, things.type_id, floats(frame, 10), floats(frame, 11)[: shape[4]],
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
     _depths(

@@ -16,7 +16,7 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_kind, outlier_density, ray_mixture
-from bayes3d_ros.likelihood.hypotheses import Drawn, Scenes
+from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
 from bayes3d_ros.likelihood.march import (
     MOST_STEPS,
     NEAR,
@@ -27,7 +27,7 @@ from bayes3d_ros.likelihood.march import (
     on_its_way,
 )
 from bayes3d_ros.likelihood.plane import plane_depth
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.tiles import LARGE, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
@@ -49,7 +49,7 @@ class _Inputs(NamedTuple):
     plane: Any  # 4 a hypothesis
     rectangle: Any  # 4 a hypothesis: u, v of the first pixel and one past the last
     depth: Any  # of the image
-    kind: Any
+    pixel_class: Any
     ray_x: Any
     ray_y: Any
     numbers: Any  # focal 2, centre 2, outlier_scale, front_margin, weight, the camera's rows
@@ -83,8 +83,8 @@ class _Shape(NamedTuple):
 @partial(jax.jit, static_argnames=("window", "interpret"))
 def triton_gain(
     drawn: Drawn,
-    scenes: Scenes | None,
-    image: Image,
+    scenes: SceneDepths | None,
+    image: ScoredImage,
     library: LibraryArrays,
     noise: Noise,
     window: int,
@@ -123,7 +123,7 @@ def triton_gain(
         plane=drawn.plane.ravel(),
         rectangle=_rectangles(drawn, image, library, window // 2).ravel(),
         depth=image.depth.ravel(),
-        kind=image.kind.ravel(),
+        pixel_class=image.pixel_class.ravel(),
         ray_x=image.ray_x,
         ray_y=image.ray_y,
         numbers=jnp.stack([jnp.asarray(n, jnp.float32) for n in numbers]),
@@ -146,7 +146,7 @@ def triton_gain(
     return gain.reshape(count, shape.sigmas, columns)[:, :, : len(noise.p_outlier)]
 
 
-def _rectangles(drawn: Drawn, image: Image, library: LibraryArrays, half: int) -> Int[Array, "N 4"]:
+def _rectangles(drawn: Drawn, image: ScoredImage, library: LibraryArrays, half: int) -> Int[Array, "N 4"]:
     """First and one past the last column and row of the pixels whose windows a hypothesis may meet."""
     (height, width), own_rows = image.depth.shape, image.own_rows
     tiles = tiles_of_objects(drawn.T_camera_object, drawn.type, image, library, half, drawn.everywhere, LARGE.tile)
@@ -214,12 +214,12 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
         depth = plane_depth(normal, offset, x, y)
         for which in range(shape.objects):
             thing = n * shape.objects + which
-            kind = given.type[thing]
+            type_id = given.type[thing]
             walk, t = enter_grid(
-                given.first[kind],
-                [given.dims[3 * kind + a] for a in range(3)],
-                [given.origin[3 * kind + a] for a in range(3)],
-                given.size[kind],
+                given.first[type_id],
+                [given.dims[3 * type_id + a] for a in range(3)],
+                [given.origin[3 * type_id + a] for a in range(3)],
+                given.size[type_id],
                 [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
                 (x, y),
                 NEAR,
@@ -263,7 +263,7 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
         at = v * shape.width + u
         pixels = Pixels(
             depth=triton.load(given.depth.at[at]),
-            kind=triton.load(given.kind.at[at]),
+            pixel_class=triton.load(given.pixel_class.at[at]),
             ray_x=triton.load(given.ray_x.at[u]),
             ray_y=triton.load(given.ray_y.at[v]),
             step_x=1 / fx,
@@ -277,7 +277,7 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
             return triton.load(patches.at[patch + place], mask=real, other=NO_SURFACE)
 
         if not shape.scene:
-            alone = jnp.where(pixels.kind == NO_RETURN, 0.0, jnp.log(outlier_density(pixels)))[:, None]
+            alone = jnp.where(pixels.pixel_class == NO_RETURN, 0.0, jnp.log(outlier_density(pixels)))[:, None]
             value = log_of(pixels, drawn, sigma)
         else:
             scene_height, scene_width = shape.scene

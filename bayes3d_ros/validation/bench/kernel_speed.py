@@ -22,7 +22,7 @@ from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.likelihood.camera_score import World, log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.sharding import on_all, over_devices
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import load_library
@@ -47,7 +47,7 @@ class Workload(NamedTuple):
     """Hypotheses of a size of image, and the image that they are scored against: the first of them, with noise."""
 
     T_camera_object: Float[np.ndarray, "N 4 4"]
-    image: Image
+    image: ScoredImage
     library: LibraryArrays
     rays: Float[np.ndarray, "H W 3"]
 
@@ -76,14 +76,14 @@ def workload(size: int, count: int, library_folder: Path) -> Workload:
     depth = np.asarray(march(arrays, jnp.int32(0), jnp.asarray(T[0], jnp.float32), pair))
     depth = np.where(np.isfinite(depth), depth, BACKGROUND)
     depth = depth + SIGMA * np.random.default_rng(1).normal(size=depth.shape)
-    image = Image(
+    image = ScoredImage(
         depth=jnp.asarray(depth, jnp.float32),
-        kind=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
+        pixel_class=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
         focal=jnp.array([camera.fx, camera.fy], jnp.float32),
         centre=jnp.array([camera.cx, camera.cy], jnp.float32),
-        table=jnp.full(depth.shape, jnp.inf),
+        bare_depth=jnp.full(depth.shape, jnp.inf),
         outlier_scale=jnp.float32(3 / (FAR**3 - NEAR**3)),
         front_margin=jnp.float32(0.01),
     )
@@ -95,14 +95,14 @@ def noise() -> Noise:
     return Noise(jnp.array([SIGMA]), jnp.array([P_OUTLIER]))
 
 
-def _both(T, image: Image, library: LibraryArrays):
+def _both(T, image: ScoredImage, library: LibraryArrays):
     world = World(jnp.zeros(1, jnp.int32), jnp.eye(4)[None], jnp.asarray(False))
     return log_likelihood_of_cameras(T, world, image, library, noise(), WINDOW)[:, 0, 0]
 
 
-def _render(T, image: Image, library: LibraryArrays):
+def _render(T, image: ScoredImage, library: LibraryArrays):
     """With nothing observed no window is looked at."""
-    return _both(T, image._replace(kind=jnp.zeros_like(image.kind)), library)
+    return _both(T, image._replace(pixel_class=jnp.zeros_like(image.pixel_class)), library)
 
 
 OURS: dict[str, Callable] = {"render": _render, "render+score": _both}

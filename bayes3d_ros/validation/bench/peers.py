@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from bayes3d_ros.likelihood.density import LATERAL, Noise
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
@@ -68,7 +68,7 @@ def installed() -> list[str]:
 
 
 def plain_log_likelihood(
-    T_camera_object: Float[Array, "N 4 4"], image: Image, library: LibraryArrays, noise: Noise, window: int
+    T_camera_object: Float[Array, "N 4 4"], image: ScoredImage, library: LibraryArrays, noise: Noise, window: int
 ) -> Float[Array, "N"]:
     """The default likelihood as one would write it down: whole images of all hypotheses, every operation on its own.
     Of returns in the workspace and one pair of noise values; log p(image | hypothesis)."""

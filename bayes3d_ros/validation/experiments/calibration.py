@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.calibration_plot import plot
 from bayes3d_ros.validation.reference.calibration_problem import (
-    Problem,
+    CalibrationProblem,
     Samples,
     log_likelihood,
     observe,
@@ -60,7 +60,7 @@ def steps(quick: bool) -> Iterator[list[Row]]:
         yield [scene_row(k, problem)]
 
 
-def scene_row(k: int, problem: Problem, sigma_error: float = 1.0) -> Row:
+def scene_row(k: int, problem: CalibrationProblem, sigma_error: float = 1.0) -> Row:
     """Draw scene k and its image, sample the posterior, and rank the truth in it. With a `sigma_error` other than one
     the images are noisier than the truth says: what calibration must find."""
     scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SEED), k))
@@ -78,7 +78,7 @@ def scene_row(k: int, problem: Problem, sigma_error: float = 1.0) -> Row:
 
 
 def ranked(
-    k: int, truth: dict[str, Any], objects: Contact, samples: Samples, types: int, rng: np.random.Generator
+    k: int, truth: dict[str, Any], objects: Placement, samples: Samples, types: int, rng: np.random.Generator
 ) -> Row:
     """The row of a scene from its true latents, its true objects [M], and the samples."""
     values: dict[str, np.ndarray] = {
@@ -123,7 +123,7 @@ def ranked(
 
 
 class _Objects(NamedTuple):
-    """`Contact` as numpy arrays."""
+    """`Placement` as numpy arrays."""
 
     type: Int[np.ndarray, "S"]
     face: Int[np.ndarray, "S"]
@@ -132,7 +132,7 @@ class _Objects(NamedTuple):
     yaw: Float[np.ndarray, "S"]
 
 
-def _first(objects: Contact, number: Int[np.ndarray, "S"]) -> _Objects:
+def _first(objects: Placement, number: Int[np.ndarray, "S"]) -> _Objects:
     """Of scenes of number >= 1 objects [S, M], the object with the smallest x."""
     there = np.arange(objects.type.shape[1]) < number[:, None]
     index = np.argmin(np.where(there, objects.x, np.inf), 1)[:, None]

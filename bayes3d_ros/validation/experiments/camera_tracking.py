@@ -120,7 +120,7 @@ def track_row(recordings: Recordings, thing: str, size: int, frames: str, hypoth
     poses, recorded = recordings.poses(thing), recordings.frames(thing, frames, size)
     settings = TrackerSettings(sigma_max=NOISELESS) if frames == "own" else TrackerSettings()
     tracker = CameraTracker(recordings.library, replace(settings, score_width=size, hypotheses=hypotheses))
-    known = tracker.start(KnownWorld((OBJECTS[thing],), np.eye(4)[None], table=False), poses[0])
+    known = tracker.start(KnownWorld((OBJECTS[thing],), np.eye(4)[None], table_visible=False), poses[0])
     seconds, position, orientation, lost = [], [], [], 0
     for k, frame in enumerate(recorded):
         if k == 0:

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayes3d_ros.objects.placement import Contact
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.exactness_plot import plot
 from bayes3d_ros.validation.reference.exact_pairs import enumerate_apart
 from bayes3d_ros.validation.reference.exact_reference import YAW_BINS, Marginals, enumerate_object, marginals
-from bayes3d_ros.validation.reference.small_problems import PROBLEMS, Problem
+from bayes3d_ros.validation.reference.small_problems import PROBLEMS, SmallProblem
 from bayes3d_ros.validation.statistics.agreement import (
     evidence_weights,
     log_mean,
@@ -46,12 +46,12 @@ class Run(NamedTuple):
     """One run of the sampler."""
 
     log_evidence: tuple[float, ...]  # of 0, 1, .. objects
-    contact: Contact  # [N, k], scenes of the most objects
+    placement: Placement  # [N, k], scenes of the most objects
     weight: Float[np.ndarray, "N"]  # sums to one
     ess: float  # of those, not divided by N; what descends from one draw counts once; of the slot with the fewest
 
 
-def run(problem: Problem, seed: int, particles: int = PARTICLES, step: Callable = smc.step) -> Run:
+def run(problem: SmallProblem, seed: int, particles: int = PARTICLES, step: Callable = smc.step) -> Run:
     """As many stages as the problem has true objects. All that is asked of the sampler stands here."""
     objects, key = len(problem.truth.type), jax.random.key(seed)
     state = smc.init(problem.context, problem.grid, particles, problem.max_objects, problem.table_size, problem.window)
@@ -63,16 +63,16 @@ def run(problem: Problem, seed: int, particles: int = PARTICLES, step: Callable 
         )  # fmt: skip
         log_evidence.append(float(state.log_evidence))
     weight = np.exp(np.asarray(state.log_weight, np.float64))
-    contact: Contact = jax.tree.map(lambda a: np.asarray(a)[:, :objects], state.objects)
+    placement: Placement = jax.tree.map(lambda a: np.asarray(a)[:, :objects], state.objects)
     line = np.asarray(state.line)
     ess = min(effective_size(weight, [line[:, k]]) for k in range(objects))
-    return Run(tuple(log_evidence), contact, weight / weight.sum(), ess)
+    return Run(tuple(log_evidence), placement, weight / weight.sum(), ess)
 
 
-def run_marginals(problem: Problem, result: Run) -> Marginals:
+def run_marginals(problem: SmallProblem, result: Run) -> Marginals:
     """Of an object of the scenes chosen at random."""
-    objects = result.contact.type.shape[1]
-    return marginals(problem, jax.tree.map(np.ravel, result.contact), np.repeat(result.weight, objects))
+    objects = result.placement.type.shape[1]
+    return marginals(problem, jax.tree.map(np.ravel, result.placement), np.repeat(result.weight, objects))
 
 
 def binned(name: str, values: Sequence[float] | np.ndarray) -> Float[np.ndarray, "B"]:
@@ -106,7 +106,7 @@ def steps(quick: bool) -> Iterator[list[Row]]:
             yield [seed_row(problem, exact, seed)]
 
 
-def reference_row(problem: Problem) -> Row:
+def reference_row(problem: SmallProblem) -> Row:
     """The enumeration of a problem."""
     start = time.perf_counter()
     row: Row = {"what": "reference", "problem": problem.name}
@@ -133,7 +133,7 @@ def reference_row(problem: Problem) -> Row:
     }
 
 
-def seed_row(problem: Problem, exact: Row, seed: int) -> Row:
+def seed_row(problem: SmallProblem, exact: Row, seed: int) -> Row:
     """One run of the sampler, compared with the enumeration."""
     start = time.perf_counter()
     result = run(problem, seed)

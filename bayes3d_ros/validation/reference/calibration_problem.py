@@ -17,11 +17,11 @@ from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Likelihood
 from bayes3d_ros.likelihood.noise import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_scene, pad_scene
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact, Table
+from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.search import Context
@@ -47,12 +47,12 @@ SETTINGS = ParserSettings(
 )
 
 
-class Problem(NamedTuple):
+class CalibrationProblem(NamedTuple):
     """What all scenes share."""
 
     library: LibraryArrays
     table: Table
-    blank: Image  # an image without depth
+    blank: ScoredImage  # an image without depth
     grid: NoiseGrid
     limits: DepthRange
     log_count: Float[np.ndarray, "M+1"]  # log P(n), n = 0..M, up to a constant
@@ -63,7 +63,7 @@ class Samples(NamedTuple):
     """The posterior as the mixture of all stages: S weighted scenes, each with a draw of the noise."""
 
     number: Int[np.ndarray, "S"]  # of objects
-    objects: Contact  # [S, M]
+    objects: Placement  # [S, M]
     sigma: Float[np.ndarray, "S"]
     p_outlier: Float[np.ndarray, "S"]
     log_likelihood: Float[np.ndarray, "S"]  # noise integrated out, up to a constant of the image
@@ -79,21 +79,21 @@ def small_library() -> Library:
     return Library(tuple(model_from_mesh(shape, name, VOXEL) for name, shape in shapes.items()))
 
 
-def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
+def small_problem(settings: ParserSettings = SETTINGS) -> CalibrationProblem:
     """The library on a table seen from above by half a right angle."""
     c, s = np.cos(TILT), np.sin(TILT)
     T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, DISTANCE], [0, 0, 0, 1]])
     rays = CAMERA.rays()
     bare = T_camera_table[:3, 2] @ T_camera_table[:3, 3] / (rays @ T_camera_table[:3, 2])
     limits = DepthRange(settings.near, settings.far)
-    blank = Image(
+    blank = ScoredImage(
         depth=jnp.zeros(bare.shape, jnp.float32),
-        kind=jnp.full(bare.shape, IN_WORKSPACE, jnp.int32),
+        pixel_class=jnp.full(bare.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
         focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
         centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
-        table=jnp.asarray(bare, jnp.float32),
+        bare_depth=jnp.asarray(bare, jnp.float32),
         outlier_scale=jnp.float32(limits.outlier_scale),
         front_margin=jnp.float32(3 * settings.sigma_max),
         likelihood=Likelihood(settings.likelihood),
@@ -102,14 +102,14 @@ def small_problem(settings: ParserSettings = SETTINGS) -> Problem:
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
     grid = noise_model.noise_grid(settings.sigma_max)
-    return Problem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
+    return CalibrationProblem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
 
 
 def _table_size(settings: ParserSettings) -> tuple[float, float]:
     return settings.table_width, settings.table_depth
 
 
-def render(objects: Contact, number: int, problem: Problem) -> Float[np.ndarray, "H W"]:
+def render(objects: Placement, number: int, problem: CalibrationProblem) -> Float[np.ndarray, "H W"]:
     """Depth of the first `number` of objects [M] on the table, as the sampler draws it."""
     half, (height, width) = problem.settings.window // 2, problem.blank.depth.shape
     padded = _render(objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window)
@@ -118,9 +118,9 @@ def render(objects: Contact, number: int, problem: Problem) -> Float[np.ndarray,
 
 @partial(jax.jit, static_argnames="window")
 def _render(
-    objects: Contact, number: Int[Array, ""], blank: Image, library: LibraryArrays, table: Table, window: int
+    objects: Placement, number: Int[Array, ""], blank: ScoredImage, library: LibraryArrays, table: Table, window: int
 ) -> Float[Array, "Hp Wp"]:
-    scenes = pad_scene(blank.table, window)[None]
+    scenes = pad_scene(blank.bare_depth, window)[None]
     for m in range(objects.type.shape[0]):
         one = jax.tree.map(lambda a, m=m: a[m][None], objects)
         drawn = draw_objects(one, scenes, blank, library, table, window)
@@ -129,20 +129,22 @@ def _render(
 
 
 def observe(
-    rng: np.random.Generator, surface: Float[np.ndarray, "H W"], noise: tuple[float, float], problem: Problem
-) -> Image:
+    rng: np.random.Generator, surface: Float[np.ndarray, "H W"], noise: tuple[float, float], problem: CalibrationProblem
+) -> ScoredImage:
     """What the likelihood is a density of, given rendered depth and noise (sigma, p_outlier): an image of which every
     pixel returned, or as many free points; of those the depth image holds one a pixel, for the search to look at."""
     rays = np.asarray(problem.blank.ray_x), np.asarray(problem.blank.ray_y)
     if problem.settings.likelihood == "points":
         points = draw_points(rng, surface, *rays, noise, problem.limits)
-        some = points.kind[0] != NO_RETURN
-        return problem.blank._replace(depth=jnp.where(some, points.depth[0], 0.0), kind=points.kind[0], points=points)
+        some = points.pixel_class[0] != NO_RETURN
+        return problem.blank._replace(
+            depth=jnp.where(some, points.depth[0], 0.0), pixel_class=points.pixel_class[0], points=points
+        )
     depth = draw_depth(rng, surface, *rays, noise, problem.limits, problem.settings.window)
     return problem.blank._replace(depth=jnp.asarray(depth, jnp.float32))
 
 
-def log_likelihood(surface: Float[np.ndarray, "H W"], image: Image, problem: Problem) -> float:
+def log_likelihood(surface: Float[np.ndarray, "H W"], image: ScoredImage, problem: CalibrationProblem) -> float:
     """log p(image | rendered depth), noise integrated out, with the constant of `Samples`."""
     window = problem.settings.window
     grid = noise_model.for_image(problem.grid, image, window)
@@ -150,16 +152,16 @@ def log_likelihood(surface: Float[np.ndarray, "H W"], image: Image, problem: Pro
 
 
 @partial(jax.jit, static_argnames="window")
-def _log_likelihood(surface: Float[Array, "H W"], image: Image, grid: NoiseGrid, window: int) -> Float[Array, ""]:
-    scenes = pad_scene(jnp.stack([image.table, surface]), window)
-    empty, table = log_likelihood_scene(scenes, image, grid.coarse, window)
-    return noise_model.log_marginal((table - empty.max())[None], grid)[0]
+def _log_likelihood(surface: Float[Array, "H W"], image: ScoredImage, grid: NoiseGrid, window: int) -> Float[Array, ""]:
+    scenes = pad_scene(jnp.stack([image.bare_depth, surface]), window)
+    empty, loglik_grid = log_likelihood_scene(scenes, image, grid.coarse, window)
+    return noise_model.log_marginal((loglik_grid - empty.max())[None], grid)[0]
 
 
 _sample_noise = jax.jit(noise_model.sample)
 
 
-def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
+def sample(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProblem) -> Samples:
     """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
     settings, context = problem.settings, Context(image, problem.library, problem.table)
     grid = noise_model.for_image(problem.grid, image, settings.window)
@@ -191,7 +193,7 @@ def sample(key: PRNGKeyArray, image: Image, problem: Problem) -> Samples:
                 settings.ess_threshold,
                 Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating)),
             )
-        noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.table, grid)
+        noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.loglik_grid, grid)
         log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
         stages.append(
             Samples(

@@ -23,9 +23,9 @@ from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES
-from bayes3d_ros.objects.placement import Contact, T_camera_object, log_prior
+from bayes3d_ros.objects.placement import Placement, T_camera_object, log_prior
 from bayes3d_ros.parsing.search import Context
-from bayes3d_ros.validation.reference.small_problems import Problem
+from bayes3d_ros.validation.reference.small_problems import SmallProblem
 
 YAW_BINS = 36  # that yaws are compared in
 FINE_YAW_BINS, XY_BINS = 180, 220  # that marginals are kept in: 2 degrees; 1 mm on a table of 22 cm
@@ -40,7 +40,7 @@ _STILL, _NEARLY = 0.01, 0.03
 BATCH = 128  # objects; one shape, so that there is one compilation
 
 
-Where = Callable[[Contact], np.ndarray]  # contacts [N] -> bool [N]
+Where = Callable[[Placement], np.ndarray]  # placements [N] -> bool [N]
 
 
 _march = jax.jit(march)
@@ -49,7 +49,7 @@ _march = jax.jit(march)
 class Cells(NamedTuple):
     """A tiling of the space of one object."""
 
-    contact: Contact  # [N], the cells' middles
+    placement: Placement  # [N], the cells' middles
     width: Float[np.ndarray, "N 3"]  # metres, metres, radians
     log_value: Float[np.ndarray, "N"]  # log of prior times likelihood, relative to the scene without the object
 
@@ -58,11 +58,11 @@ class Cells(NamedTuple):
         return self.log_value + np.log(self.width).sum(1)
 
 
-class Scene(NamedTuple):
+class GivenScene(NamedTuple):
     """What an object is added to."""
 
     depth: Float[Array, "1 Hp Wp"]  # padded
-    table: Float[Array, "1 S P"]  # log likelihood on the coarse grid of noise, up to one constant
+    loglik_grid: Float[Array, "1 S P"]  # log likelihood on the coarse grid of noise, up to one constant
     log_likelihood: Float[Array, "1"]  # noise integrated out, up to the same constant
 
 
@@ -72,29 +72,29 @@ class Reference(NamedTuple):
     cells: Cells
     log_evidence: tuple[float, ...]  # relative to the scene without the object; of every level, the last is the finest
 
-    def marginals(self, problem: Problem) -> "Marginals":
+    def marginals(self, problem: SmallProblem) -> "Marginals":
         weight = np.exp(self.cells.log_mass - self.cells.log_mass.max())
-        return marginals(problem, self.cells.contact, weight, self.cells.width)
+        return marginals(problem, self.cells.placement, weight, self.cells.width)
 
 
-def empty_table(problem: Problem) -> Scene:
-    return _scene(problem, problem.context.image.table)
+def empty_table(problem: SmallProblem) -> GivenScene:
+    return _scene(problem, problem.context.image.bare_depth)
 
 
-def with_object(problem: Problem, contact: Contact) -> Scene:
-    """The table with one object, drawn and scored as a whole; contact [1]."""
+def with_object(problem: SmallProblem, placement: Placement) -> GivenScene:
+    """The table with one object, drawn and scored as a whole; placement [1]."""
     image, library, table = problem.context
-    one = jax.tree.map(lambda a: a[0], single(contact))
+    one = jax.tree.map(lambda a: a[0], single(placement))
     rays = jnp.meshgrid(image.ray_x, image.ray_y)
     depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
-    return _scene(problem, jnp.minimum(image.table, depth))
+    return _scene(problem, jnp.minimum(image.bare_depth, depth))
 
 
-def _scene(problem: Problem, depth: Float[Array, "H W"]) -> Scene:
+def _scene(problem: SmallProblem, depth: Float[Array, "H W"]) -> GivenScene:
     padded = pad_scene(depth, problem.window)[None]
-    table = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
-    table = table - table.max()
-    return Scene(padded, table, log_marginal(table, problem.grid))
+    loglik_grid = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
+    loglik_grid = loglik_grid - loglik_grid.max()
+    return GivenScene(padded, loglik_grid, log_marginal(loglik_grid, problem.grid))
 
 
 def yaw_cells(count: int) -> tuple[Float[np.ndarray, "count"], float]:
@@ -104,56 +104,63 @@ def yaw_cells(count: int) -> tuple[Float[np.ndarray, "count"], float]:
 
 
 def all_cells(
-    problem: Problem, cell: float = CELL, yaws: int = YAW_BINS // 2
-) -> tuple[Contact, Float[np.ndarray, "N 3"]]:
+    problem: SmallProblem, cell: float = CELL, yaws: int = YAW_BINS // 2
+) -> tuple[Placement, Float[np.ndarray, "N 3"]]:
     """Cells that tile the prior's support: for every type and face their own, up to the rim of its rectangle."""
     library = problem.context.library
     yaw, yaw_width = yaw_cells(yaws)
     rows, widths = [], []
-    for kind in range(int(library.num_types)):
+    for type_id in range(int(library.num_types)):
         for face in range(NUM_FACES):
-            free = np.asarray(problem.context.table.size) - np.asarray(library.face_size[kind, face])
+            free = np.asarray(problem.context.table.size) - np.asarray(library.face_size[type_id, face])
             number = np.ceil(free / cell).astype(int)
             x, y = (((np.arange(n) + 0.5) / n - 0.5) * f for n, f in zip(number, free, strict=True))
-            grid = np.stack(np.meshgrid([kind], [face], x, y, yaw, indexing="ij"), -1).reshape(-1, 5)
+            grid = np.stack(np.meshgrid([type_id], [face], x, y, yaw, indexing="ij"), -1).reshape(-1, 5)
             rows.append(grid)
             widths.append(np.tile([*(free / number), yaw_width], (len(grid), 1)))
     return _contact(np.concatenate(rows)), np.concatenate(widths)
 
 
-def _contact(rows: Float[np.ndarray, "N 5"]) -> Contact:
-    return Contact(*rows[:, :2].T.astype(np.int32), *rows[:, 2:].T)
+def _contact(rows: Float[np.ndarray, "N 5"]) -> Placement:
+    return Placement(*rows[:, :2].T.astype(np.int32), *rows[:, 2:].T)
 
 
-def take(contact: Contact, index: np.ndarray | slice | list[int]) -> Contact:
-    return jax.tree.map(lambda a: np.asarray(a)[index], contact)
+def take(placement: Placement, index: np.ndarray | slice | list[int]) -> Placement:
+    return jax.tree.map(lambda a: np.asarray(a)[index], placement)
 
 
-def single(contact: Contact) -> Contact:
+def single(placement: Placement) -> Placement:
     """As the model takes it: float32 on the device."""
-    kinds, places = (jnp.asarray(a, jnp.int32) for a in contact[:2]), (jnp.asarray(a, jnp.float32) for a in contact[2:])
-    return Contact(*kinds, *places)
+    kinds, places = (
+        (jnp.asarray(a, jnp.int32) for a in placement[:2]),
+        (jnp.asarray(a, jnp.float32) for a in placement[2:]),
+    )
+    return Placement(*kinds, *places)
 
 
 @partial(jax.jit, static_argnames="window")
-def _gains(contact: Contact, scene: Scene, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N S P"]:
-    nobody = jnp.zeros(contact.type.shape, jnp.int32)
-    return log_likelihood_gain(contact, nobody, scene.depth, *context, grid.coarse, window)
+def _gains(
+    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+) -> Float[Array, "N S P"]:
+    nobody = jnp.zeros(placement.type.shape, jnp.int32)
+    return log_likelihood_gain(placement, nobody, scene.depth, *context, grid.coarse, window)
 
 
 @partial(jax.jit, static_argnames="window")
-def _values(contact: Contact, scene: Scene, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N"]:
-    gain = _gains(contact, scene, context, grid, window)
-    value = log_marginal(scene.table + gain, grid) - scene.log_likelihood
-    return value + log_prior(contact, context.library, context.table)
+def _values(
+    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+) -> Float[Array, "N"]:
+    gain = _gains(placement, scene, context, grid, window)
+    value = log_marginal(scene.loglik_grid + gain, grid) - scene.log_likelihood
+    return value + log_prior(placement, context.library, context.table)
 
 
-def _batched(function, problem: Problem, scene: Scene, contact: Contact) -> np.ndarray:
+def _batched(function, problem: SmallProblem, scene: GivenScene, placement: Placement) -> np.ndarray:
     """In batches of one shape, a thread a core: a batch keeps one busy. float64."""
-    count = len(contact.type)
+    count = len(placement.type)
 
     def batch(start: int) -> np.ndarray:
-        some = take(contact, np.arange(start, start + BATCH) % count)
+        some = take(placement, np.arange(start, start + BATCH) % count)
         values = function(single(some), scene, problem.context, problem.grid, problem.window)
         return np.asarray(values, np.float64)
 
@@ -161,14 +168,14 @@ def _batched(function, problem: Problem, scene: Scene, contact: Contact) -> np.n
         return np.concatenate(list(pool.map(batch, range(0, count, BATCH))))[:count]
 
 
-def all_gains(problem: Problem, scene: Scene, contact: Contact) -> Float[np.ndarray, "N S P"]:
+def all_gains(problem: SmallProblem, scene: GivenScene, placement: Placement) -> Float[np.ndarray, "N S P"]:
     """Log likelihood that objects add to a scene, at every noise level of the coarse grid."""
-    return _batched(_gains, problem, scene, contact)
+    return _batched(_gains, problem, scene, placement)
 
 
 def enumerate_object(
-    problem: Problem,
-    scene: Scene | None = None,
+    problem: SmallProblem,
+    scene: GivenScene | None = None,
     levels: Levels = LEVELS,
     where: Where | None = None,
     cell: float = CELL,
@@ -176,11 +183,11 @@ def enumerate_object(
     """The posterior of one object added to a scene (by default the empty table). The best cells are halved len(levels)
     times, fewer once the evidence stands still. `where` leaves out cells of the first level."""
     scene = empty_table(problem) if scene is None else scene
-    contact, width = all_cells(problem, cell)
+    placement, width = all_cells(problem, cell)
     if where is not None:
-        inside = where(contact)
-        contact, width = take(contact, inside), width[inside]
-    cells = Cells(contact, width, _batched(_values, problem, scene, contact))
+        inside = where(placement)
+        placement, width = take(placement, inside), width[inside]
+    cells = Cells(placement, width, _batched(_values, problem, scene, placement))
     log_evidence = [float(logsumexp(cells.log_mass))]
     for within, share in levels:
         cells = halve(cells, heavy(cells, within, share), problem, scene)
@@ -191,10 +198,10 @@ def enumerate_object(
     return Reference(cells, tuple(log_evidence))
 
 
-def halve(cells: Cells, which: np.ndarray, problem: Problem, scene: Scene) -> Cells:
+def halve(cells: Cells, which: np.ndarray, problem: SmallProblem, scene: GivenScene) -> Cells:
     """Cut some cells in two along x, y and yaw: eight of each."""
     eighth = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    some = take(cells.contact, which)
+    some = take(cells.placement, which)
     offset = (cells.width[which][:, None] * eighth).reshape(-1, 3).T
     small = jax.tree.map(lambda a: np.repeat(a, 8), some)
     small = small._replace(x=small.x + offset[0], y=small.y + offset[1], yaw=small.yaw + offset[2])
@@ -214,7 +221,10 @@ class Marginals(NamedTuple):
 
 
 def marginals(
-    problem: Problem, contact: Contact, weight: Float[np.ndarray, "N"], width: Float[np.ndarray, "N 3"] | None = None
+    problem: SmallProblem,
+    placement: Placement,
+    weight: Float[np.ndarray, "N"],
+    width: Float[np.ndarray, "N 3"] | None = None,
 ) -> Marginals:
     """Of weighted objects: samples or, with their width, enumerated cells, whose mass is spread over them."""
     weight = np.asarray(weight, np.float64) / np.sum(weight, dtype=np.float64)
@@ -226,11 +236,11 @@ def marginals(
         index = np.floor((np.asarray(place, np.float64)[:, None] + spread) / period * bins).astype(int) % bins
         return np.bincount(index.ravel(), np.repeat(weight / len(parts), len(parts)), bins)
 
-    x, y = (np.asarray(a) + size / 2 for a, size in zip((contact.x, contact.y), problem.table_size, strict=True))
+    x, y = (np.asarray(a) + size / 2 for a, size in zip((placement.x, placement.y), problem.table_size, strict=True))
     return Marginals(
-        np.bincount(np.asarray(contact.type), weight, len(problem.library.models)),
-        np.bincount(np.asarray(contact.face), weight, NUM_FACES),
-        histogram(contact.yaw, 2, 2 * np.pi, FINE_YAW_BINS),
+        np.bincount(np.asarray(placement.type), weight, len(problem.library.models)),
+        np.bincount(np.asarray(placement.face), weight, NUM_FACES),
+        histogram(placement.yaw, 2, 2 * np.pi, FINE_YAW_BINS),
         histogram(x, 0, problem.table_size[0], XY_BINS),
         histogram(y, 1, problem.table_size[1], XY_BINS),
     )
@@ -246,4 +256,4 @@ def heavy(cells: Cells, within: float, share: float = 0.0) -> np.ndarray:
 
 
 def chosen(cells: Cells, which: np.ndarray) -> Cells:
-    return Cells(take(cells.contact, which), cells.width[which], cells.log_value[which])
+    return Cells(take(cells.placement, which), cells.width[which], cells.log_value[which])

@@ -12,7 +12,7 @@ from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Pixels, inli
 from bayes3d_ros.likelihood.noise import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import FreePoints
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
-from bayes3d_ros.objects.placement import Contact, Table, overlap
+from bayes3d_ros.objects.placement import Placement, Table, overlap
 from bayes3d_ros.parsing.smc import OVERLAP_LIMIT
 
 _BATCH, _TRIALS = 8, 200  # proposals of a scene drawn at a time; how many times
@@ -35,7 +35,7 @@ class DepthRange(NamedTuple):
 
 def draw_scene(
     key: PRNGKeyArray, log_count: Float[np.ndarray, "M+1"], library: LibraryArrays, table: Table
-) -> tuple[Contact, int]:
+) -> tuple[Placement, int]:
     """A scene from the joint prior `P(n) prod p(object) 1[disjoint]`, normalised once over everything: n and the
     objects are drawn together, and both are drawn again where two solids conflict. So small n become likelier than
     `P(n)`, as the sampler's `P(n) Z_n` has them. log_count: log P(n), n = 0..M. Returns objects [M], of which the
@@ -54,17 +54,17 @@ def draw_scene(
 @jax.jit
 def _proposals(
     key: PRNGKeyArray, log_count: Float[Array, "M+1"], library: LibraryArrays, table: Table
-) -> tuple[Contact, Array, Array]:
+) -> tuple[Placement, Array, Array]:
     """Scenes without regard to conflicts: objects [B, M], counts [B], and whether they are free of conflicts [B]."""
     most = log_count.shape[0] - 1
     keys = jax.random.split(key, 5)
     shape = (_BATCH, most)
-    kind = jax.random.randint(keys[0], shape, 0, library.num_types)
+    type_id = jax.random.randint(keys[0], shape, 0, library.num_types)
     face = jax.random.randint(keys[1], shape, 0, NUM_FACES)
-    free = jnp.maximum(table.size - library.face_size[kind, face], 1e-3)  # as in `log_prior`
+    free = jnp.maximum(table.size - library.face_size[type_id, face], 1e-3)  # as in `log_prior`
     xy = (jax.random.uniform(keys[2], (*shape, 2)) - 0.5) * free
     yaw = jax.random.uniform(keys[3], shape, maxval=2 * jnp.pi)
-    objects = Contact(kind, face, xy[..., 0], xy[..., 1], yaw)
+    objects = Placement(type_id, face, xy[..., 0], xy[..., 1], yaw)
     count = jax.random.categorical(keys[4], log_count, shape=(_BATCH,))
     disjoint = jnp.ones(_BATCH, bool)
     for a in range(most):
@@ -153,10 +153,10 @@ def draw_points(
     if layer.max() >= _LAYERS:
         raise ValueError(f"a pixel holds {layer.max() + 1} points, expected at most {_LAYERS}")
     depth, beside_x, beside_y = np.ones((3, _LAYERS, height, width), np.float32)
-    kind = np.full(depth.shape, NO_RETURN, np.int32)
+    pixel_class = np.full(depth.shape, NO_RETURN, np.int32)
     at = layer, v, u
-    depth[at], beside_x[at], beside_y[at], kind[at] = z, x / z - ray_x[u], y / z - ray_y[v], IN_WORKSPACE
-    return FreePoints(*(jnp.asarray(a) for a in (depth, kind, beside_x, beside_y)))
+    depth[at], beside_x[at], beside_y[at], pixel_class[at] = z, x / z - ray_x[u], y / z - ray_y[v], IN_WORKSPACE
+    return FreePoints(*(jnp.asarray(a) for a in (depth, pixel_class, beside_x, beside_y)))
 
 
 @partial(jax.jit, static_argnames="window")
@@ -179,7 +179,7 @@ def _draw_inliers(
         one = jnp.zeros(())
         pixels = Pixels(
             depth=z[None],
-            kind=jnp.full((1, width, 1), IN_WORKSPACE),
+            pixel_class=jnp.full((1, width, 1), IN_WORKSPACE),
             ray_x=ray_x[None, :, None],
             ray_y=jnp.broadcast_to(ray_y[v], (1, width, 1)),
             step_x=ray_x[1] - ray_x[0],

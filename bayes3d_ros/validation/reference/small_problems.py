@@ -13,11 +13,11 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.noise import NoiseGrid, for_image, noise_grid
-from bayes3d_ros.likelihood.scored_image import Image
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Contact, T_camera_object, Table
+from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.search import Context
 
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
@@ -32,14 +32,14 @@ VOXEL = 0.005
 _march = jax.jit(march)
 
 
-class Problem(NamedTuple):
+class SmallProblem(NamedTuple):
     """An image with its library and table, and what the sampler is told beside them."""
 
     name: str
     library: Library
     context: Context
     grid: NoiseGrid
-    truth: Contact  # [k]
+    truth: Placement  # [k]
     table_size: tuple[float, float] = TABLE_SIZE
     window: int = WINDOW
     max_objects: int = MAX_OBJECTS
@@ -85,7 +85,7 @@ def make(
     meshes: dict[str, trimesh.Trimesh],
     rows: list[tuple[int, float, float, float]],
     sigma: float,
-) -> Problem:
+) -> SmallProblem:
     """An image of upright objects, rows (type, x, y, yaw): `yaw` turns their mesh. Noise is normal along the rays, its
     outliers are uniform in the frustum's volume."""
     library = Library(tuple(model_from_mesh(mesh, key, VOXEL) for key, mesh in meshes.items()))
@@ -103,29 +103,29 @@ def make(
     noisy = depth + sigma / np.linalg.norm(rays, axis=-1) * rng.normal(size=depth.shape)
     wild = np.cbrt(NEAR**3 + rng.random(depth.shape) * (FAR**3 - NEAR**3))
     observed = np.where(rng.random(depth.shape) < P_OUTLIER, wild, noisy)
-    image = Image(
+    image = ScoredImage(
         depth=jnp.asarray(observed, jnp.float32),
-        kind=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
+        pixel_class=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
         focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
         centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
-        table=jnp.asarray(bare, jnp.float32),
+        bare_depth=jnp.asarray(bare, jnp.float32),
         outlier_scale=jnp.float32(3 / (FAR**3 - NEAR**3)),
         front_margin=jnp.float32(3 * SIGMA_MAX),
     )
     context = Context(image, arrays, table)
-    return Problem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, WINDOW), truth)
+    return SmallProblem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, WINDOW), truth)
 
 
-def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Contact:
-    """Contacts that stand meshes on their lower side, turned by yaw about z, with their box's centre above (x, y)."""
+def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Placement:
+    """Placements that stand meshes on their lower side, turned by yaw about z, with their box's centre above (x, y)."""
     face = [int(np.argmin(library.models[row[0]].contact_normal[:, 2])) for row in rows]
-    kind, x, y, yaw = (np.array(column) for column in zip(*rows, strict=True))
-    turn = np.asarray(T_contact_object)[kind, face, :2, 0]  # the mesh's x axis at yaw 0
+    type_id, x, y, yaw = (np.array(column) for column in zip(*rows, strict=True))
+    turn = np.asarray(T_contact_object)[type_id, face, :2, 0]  # the mesh's x axis at yaw 0
     yaw = np.mod(yaw - np.arctan2(turn[:, 1], turn[:, 0]), 2 * np.pi)
-    whole = (jnp.asarray(a, jnp.int32) for a in (kind, np.array(face)))
-    return Contact(*whole, *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
+    whole = (jnp.asarray(a, jnp.int32) for a in (type_id, np.array(face)))
+    return Placement(*whole, *(jnp.asarray(a, jnp.float32) for a in (x, y, yaw)))
 
 
 def _bare_table(camera: Intrinsics) -> Float[np.ndarray, "H W"]:
@@ -137,7 +137,7 @@ def _bare_table(camera: Intrinsics) -> Float[np.ndarray, "H W"]:
 
 
 # Handles point away from the camera at a quarter turn.
-PROBLEMS: dict[str, Callable[[], Problem]] = {
+PROBLEMS: dict[str, Callable[[], SmallProblem]] = {
     "block": lambda: make("block", {"block": step_block()}, [(0, 0.01, -0.02, 0.4)], 0.012),
     "handle seen": lambda: make("handle seen", {"mug": cup(True)}, [(0, 0.01, -0.01, -0.4)], 0.012),
     "handle hidden": lambda: make("handle hidden", {"mug": cup(True)}, [(0, 0.01, -0.01, np.pi / 2)], 0.010),

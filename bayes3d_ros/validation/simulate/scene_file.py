@@ -30,7 +30,7 @@ class SceneObject:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SimulatedScene:
     """Objects on a table seen by a camera that may move. Metres; table frame: z up, origin on the table's centre."""
 
     path: Path
@@ -46,7 +46,7 @@ class Scene:
     noise: SensorNoise
 
 
-def load_scene(path: Path) -> Scene:
+def load_scene(path: Path) -> SimulatedScene:
     """Read a scene. Raises SimulationError, one line naming the file, the key and what was expected."""
     content = read_yaml(path, "scene file", SimulationError)
     try:
@@ -77,7 +77,7 @@ def find_mesh(source: str, folder: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _scene(path: Path, content: Any) -> Scene:
+def _scene(path: Path, content: Any) -> SimulatedScene:
     keys = ("seed", "rate", "start", "camera", "table", "objects", "noise")
     top = _mapping(content, "the scene", keys)
     camera = _mapping(top.get("camera", {}), "camera", ("intrinsics", "eye", "target", "frames", "step", "pose_noise"))
@@ -106,7 +106,7 @@ def _scene(path: Path, content: Any) -> Scene:
     cameras, start = _cameras(camera), round(_number(top.get("start", 1_700_000_000), "start"))
     if start < 0 or start + len(cameras) / rate >= 2**31:
         raise ValueError(f"start, rate: expected stamps from 0 to 2^31 seconds, got {start} s and {rate} Hz")
-    return Scene(
+    return SimulatedScene(
         path=path,
         seed=_whole(top.get("seed", 0), "seed", 0),
         rate=rate,

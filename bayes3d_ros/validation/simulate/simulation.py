@@ -13,14 +13,14 @@ from bayes3d_ros.io.bags import BagWriter
 from bayes3d_ros.validation.simulate.correlated_errors import draw_correlated_errors
 from bayes3d_ros.validation.simulate.pose_noise import disturbed
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster, Rendering
-from bayes3d_ros.validation.simulate.scene_file import Scene, load_scene
+from bayes3d_ros.validation.simulate.scene_file import SimulatedScene, load_scene
 from bayes3d_ros.validation.simulate.sensor_noise import add_sensor_noise, draw_bias_field
 
 FRAME_ID = "camera_depth_optical_frame"
 _TABLE_THICKNESS, _FLOOR_SIZE = 0.03, 20.0
 
 
-def scene_caster(scene: Scene) -> RayCaster:
+def scene_caster(scene: SimulatedScene) -> RayCaster:
     """Ray caster of a scene in the table frame; solid k < len(scene.objects) is object k, then come table and floor."""
     table, floor = np.eye(4), np.eye(4)
     table[2, 3] = -_TABLE_THICKNESS / 2
@@ -34,7 +34,7 @@ def scene_caster(scene: Scene) -> RayCaster:
     )
 
 
-def visible_fractions(scene: Scene, frame: int, rendering: Rendering) -> list[float]:
+def visible_fractions(scene: SimulatedScene, frame: int, rendering: Rendering) -> list[float]:
     """Of every object, how many of the pixels that it would cover alone it covers in `rendering`; 0 if out of view."""
     fractions = []
     for k, thing in enumerate(scene.objects):
@@ -84,7 +84,7 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
 
 
 def _truth(
-    scene: Scene, stamp_ns: int, T_table_camera: Float[np.ndarray, "4 4"], visible: list[float]
+    scene: SimulatedScene, stamp_ns: int, T_table_camera: Float[np.ndarray, "4 4"], visible: list[float]
 ) -> dict[str, Any]:
     T_camera_table = np.linalg.inv(T_table_camera)
     return {
