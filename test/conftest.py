@@ -1,56 +1,45 @@
-"""Made-up posteriors for tests of what is done with them."""
+"""What all tests share: one device, compiled code kept between sessions, array shapes checked as functions run."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fixtures import checking
+from jaxtyping import config as jaxtyping_config
+from jaxtyping import install_import_hook
 
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")  # whichever test begins; test_sharding asks for more
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "bayes3d_ros" / "jax_tests"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
-import numpy as np
-import pytest
-
-from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.posterior.summarise import summarise
-from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
-
-pytest_plugins = ["fixtures.models", "fixtures.small_scene"]
+PACKAGE = Path(__file__).resolve().parents[1] / "bayes3d_ros"
+CHECKED = ("geometry", "objects", "likelihood")
 
 
-@pytest.fixture
-def depth_frame() -> Callable[..., DepthFrame]:
-    """frame(stamp_ns): a small slanted surface with pixels that did not return."""
+def _checked_modules() -> list[str]:
+    """The modules of these rooms, but for those that numba compiles: numba reads a function's own code."""
+    found = [path for room in CHECKED for path in sorted((PACKAGE / room).glob("[!_]*.py"))]
+    plain = [path for path in found if "njit" not in path.read_text()]
+    return [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in plain]
 
-    def frame(stamp_ns: int = 1, width: int = 64, height: int = 48) -> DepthFrame:
-        depth = np.tile(np.linspace(1.2, 0.6, height, dtype=np.float32)[:, None], (1, width))
-        depth[:5, :7] = np.nan
-        return DepthFrame(depth, Intrinsics(60, 60, width / 2, height / 2, width, height), stamp_ns, "camera", None)
 
-    return frame
+# Fixtures that import the package are plugins, so that they are imported after this.
+install_import_hook(_checked_modules(), f"{checking.__name__}.checked")
+pytest_plugins = ["fixtures.models", "fixtures.posteriors", "fixtures.small_scene"]
 
 
 @pytest.fixture
-def fake_posterior() -> Callable[..., ScenePosterior]:
-    """posterior(frame, types, objects): samples around objects side by side; every seventh sample holds none."""
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that hand over what annotations forbid, to see how the package itself refuses it."""
+    monkeypatch.setattr(jaxtyping_config, "jaxtyping_disable", True)
 
-    def posterior(frame: DepthFrame, types: tuple[str, ...], objects: int = 2, count: int = 50) -> ScenePosterior:
-        rng = np.random.default_rng(frame.stamp_ns)
-        held = np.arange(4) < np.where(np.arange(count) % 7 == 6, 0, objects)[:, None]
-        kind = np.where(held, np.arange(4) % len(types), -1)
-        position = np.array([[0.15 * k - 0.2, 0.0, 0.9] for k in range(4)]) + rng.normal(0, 0.002, (count, 4, 3))
-        samples = SceneSamples(
-            np.full(count, -np.log(count)), held.sum(1), kind, np.where(held, 4, -1), position,
-            np.tile([0.0, 0, 0, 1], (count, 4, 1)), np.full(count, 0.02), np.full(count, 0.002),
-        )  # fmt: skip
-        summary = summarise(samples, types, 0.5)
-        segmentation = np.zeros(frame.depth.shape, np.uint16)
-        for label in range(1, len(summary.objects) + 1):
-            segmentation[10:30, 12 * label : 12 * label + 9] = label
-        return ScenePosterior(
-            stamp_ns=frame.stamp_ns, frame_id=frame.frame_id, types=types, objects=summary.objects,
-            num_objects=summary.num_objects, p_outlier=summary.p_outlier, sigma=summary.sigma, log_evidence=120.5,
-            samples=samples, reconstruction=np.nan_to_num(frame.depth, nan=1.0), segmentation=segmentation,
-            T_camera_table=np.eye(4), ess=(1.0, 0.5), seconds=0.25, object_index=summary.object_index,
-            notes=("made up",),
-        )  # fmt: skip
 
-    return posterior
+@pytest.fixture(scope="module", autouse=True)
+def forget_compiled_code() -> Iterator[None]:
+    """Compiled code of one file's tests is of no use to the next file's, and would add up to gigabytes."""
+    yield
+    import jax
+
+    jax.clear_caches()

@@ -83,7 +83,11 @@ def encode_depth(
 
 
 def intrinsics_from_camera_info(
-    k: Sequence[float], p: Sequence[float], width: int, height: int, image_size: tuple[int, int] | None = None
+    k: Sequence[float] | np.ndarray,
+    p: Sequence[float] | np.ndarray,
+    width: int,
+    height: int,
+    image_size: tuple[int, int] | None = None,
 ) -> Intrinsics:
     """Intrinsics from the fields of a sensor_msgs/CameraInfo: from P where it is set (rectified images), else from K.
 

@@ -126,7 +126,7 @@ def minimum_box(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "4 4"], Float[
     """T_mesh_box and size of the box of least volume; its axes are named so that they lie closest to the mesh's."""
     T_box_mesh, _ = trimesh.bounds.oriented_bounds(mesh.convex_hull.vertices)
     axes = np.linalg.inv(T_box_mesh)[:3, :3]  # columns are the box's axes in the mesh frame
-    rotation = max((axes @ relabel for relabel in _axis_relabelings(np.linalg.det(axes) > 0)), key=np.trace)
+    rotation = max((axes @ relabel for relabel in _axis_relabelings(bool(np.linalg.det(axes) > 0))), key=np.trace)
     along = mesh.convex_hull.vertices @ rotation
     low, high = along.min(0), along.max(0)
     T_mesh_box = np.eye(4)

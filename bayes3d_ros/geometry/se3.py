@@ -5,8 +5,8 @@ import jaxlie
 from jaxtyping import Array, Float
 
 
-def product(A: Float[Array, "*batch 4 4"], B: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
-    """Of matrices, written out: a multiplication may run at reduced precision on some backends."""
+def product(A: Float[Array, "... 4 4"], B: Float[Array, "... 4 4"]) -> Float[Array, "... 4 4"]:
+    """Of matrices; batches broadcast. Written out: a multiplication may run at reduced precision on some backends."""
     return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 
 

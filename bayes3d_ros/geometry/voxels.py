@@ -50,7 +50,7 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     samples = sample_surface(mesh, voxel_size / SAMPLES_PER_EDGE)
     if mesh.volume < 0:  # wound inside out
         samples = samples._replace(normals=-samples.normals)
-    patches = fit_planes(samples, origin, voxel_size, tuple(shape))
+    patches = fit_planes(samples, origin, voxel_size, tuple(shape.tolist()))
     touched = np.zeros(shape, bool)
     touched[tuple(patches.voxel.T)] = True
     occupancy = fill_enclosed(touched)

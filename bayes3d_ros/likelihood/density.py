@@ -79,7 +79,11 @@ class Pixels(NamedTuple):
 
 
 def inlier_density(
-    rendered: Float[Array, "hr wr T"], pixels: Pixels, sigma: Float[Array, "S"], window: int, lateral: float = LATERAL
+    rendered: Float[Array, "hr wr T"],
+    pixels: Pixels,
+    sigma: Float[Array, "S"],
+    window: int,
+    lateral: float | Float[Array, ""] = LATERAL,
 ) -> Float[Array, "S h w T"]:
     """The mixture over the window for every sigma, per metre; `rendered` has a border of window // 2 pixels around."""
     half = window // 2
@@ -94,7 +98,11 @@ def inlier_density(
 
 
 def ray_mixture(
-    beside: Callable[[int, int], Array], pixels: Pixels, sigma: Array, window: int, lateral: float = LATERAL
+    beside: Callable[[int, int], Array],
+    pixels: Pixels,
+    sigma: Array,
+    window: int,
+    lateral: float | Float[Array, ""] = LATERAL,
 ) -> tuple[Array, Array]:
     """The mixture over the surface points of the window, and whether there are any. beside(dv, du) is the rendered
     depth so many pixels away; sigma broadcasts against it."""
@@ -150,7 +158,7 @@ def point_density(
     return per_pixel / sigma**3 * total + background
 
 
-def outlier_density(pixels: Pixels) -> Float[Array, "h w T"]:
+def outlier_density(pixels: Pixels) -> Float[Array, "..."]:
     return pixels.outlier_scale * pixels.depth**2
 
 
@@ -174,7 +182,7 @@ def log_likelihood(
     half = window // 2
     height, width = pixels.depth.shape[:2]
     inlier = likelihoods[pixels.likelihood.name](rendered, pixels, noise.sigma, window)
-    outlier, inlier = by_kind(pixels, rendered[half : half + height, half : half + width], inlier)
+    outlier, inlier = by_pixel_class(pixels, rendered[half : half + height, half : half + width], inlier)
     tiles = outlier.shape[-1]
     at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
@@ -183,7 +191,7 @@ def log_likelihood(
     return total.reshape(*total.shape[:2], layers, -1).sum(2) if layers > 1 else total
 
 
-def by_kind(pixels: Pixels, rendered: Float[Array, "h w T"], inlier: Array) -> tuple[Array, Array]:
+def by_pixel_class(pixels: Pixels, rendered: Float[Array, "..."], inlier: Array) -> tuple[Array, Array]:
     """The outliers' and the inliers' densities of pixels of every kind, whose likelihood is p_out outlier +
     (1 - p_out) inlier; given `inlier` is that of returns in the workspace."""
     a = outlier_density(pixels)

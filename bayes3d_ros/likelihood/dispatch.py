@@ -1,7 +1,7 @@
 """The kernel for a backend."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 from jaxtyping import Array, Float
@@ -12,6 +12,7 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
+@runtime_checkable
 class Gain(Protocol):
     """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
     without scenes, nothing is there before."""

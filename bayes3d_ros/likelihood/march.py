@@ -39,14 +39,14 @@ class Rays(NamedTuple):
 @jax.jit
 def march(
     library: LibraryArrays,
-    type_index: Int[Array, "*objects"],
-    T_camera_object: Float[Array, "*objects 4 4"],
+    type_index: Int[Array, "..."],
+    T_camera_object: Float[Array, "... 4 4"],
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
     near: float = NEAR,
-) -> Float[Array, "*shape"]:
+) -> Float[Array, "..."]:
     """Depth z in metres along rays (x, y, 1) of an object each, NO_SURFACE where it is not met.
 
-    `objects` broadcasts against `shape` from the right: rays of shape [h, w, N] walk through N objects.
+    Types, poses and rays broadcast against each other: rays of shape [h, w, N] walk through N objects.
     """
     T = T_camera_object
     walk, t = enter_grid(
@@ -71,7 +71,7 @@ def enter_grid(
     T_camera_object: Sequence[Sequence[Array]],
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
     near: float,
-) -> tuple[Rays, Float[Array, "*shape"]]:
+) -> tuple[Rays, Float[Array, "..."]]:
     """Rays (x, y, 1) in the voxels of a grid, and where they enter it. The grid's numbers, and those of the rows of the
     pose, broadcast against the rays."""
     T, axes = T_camera_object, range(3)
@@ -158,7 +158,7 @@ def _picked(walk: Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> Ray
     )
 
 
-def _byte(words: Int[Array, "N"], shift: int) -> Float[Array, "N"]:
+def _byte(words: Int[Array, "*shape"], shift: int) -> Float[Array, "*shape"]:
     return jax.lax.shift_right_arithmetic(jax.lax.shift_left(words, 24 - shift), 24).astype(jnp.float32)
 
 

@@ -53,7 +53,7 @@ def _pairs(
         yield first + np.repeat(np.arange(len(some)), [len(f) for f in found]), np.concatenate(found).astype(int)
 
 
-def _cube(from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _cube(from_eye: Float[np.ndarray, "... 3"], direction: Float[np.ndarray, "... 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Where a ray enters and leaves a unit cube."""
     ends = np.stack([(from_eye - 0.5) / direction, (from_eye + 0.5) / direction])
     return ends.min(0).max(-1), ends.max(0).min(-1)

@@ -116,7 +116,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     words = np.zeros(-(-first[-1] // _VOXEL_PAD) * _VOXEL_PAD, np.int32)
     words[: first[-1]] = np.concatenate(grids)
 
-    def stack(rows: Sequence[np.ndarray | np.floating], dtype: type = np.float32) -> Array:
+    def stack(rows: Sequence[np.ndarray | np.generic], dtype: type = np.float32) -> Array:
         rows = [*rows, *[rows[0]] * (padded - count)]
         return jnp.asarray(np.stack(rows).astype(dtype))
 

@@ -78,7 +78,7 @@ def test_every_window(window, drawn, image, arrays):
     scenes = SceneDepths(pad_scene(jnp.asarray(scene), window), jnp.zeros(COUNT, jnp.int32))
     gain = np.asarray(compiled_gain(drawn, scenes, image, arrays, NOISE, window))
     depth = jnp.minimum(compiled_depth(drawn, None, image, arrays), scene)
-    after, before = (log_likelihood_scene(pad_scene(d, window), image, NOISE, window) for d in (depth, scene))
+    after, before = (log_likelihood_scene(pad_scene(jnp.asarray(d), window), image, NOISE, window) for d in (depth, scene))
     assert np.ptp(np.asarray(after)[:, 0, 0]) > 100
     np.testing.assert_allclose(gain, np.asarray(after - before), atol=0.02, rtol=2e-5)
 

@@ -89,7 +89,7 @@ def gains(kernel, placements, image, arrays, table):
         patch.setattr(scene_score, "kernel", lambda image: kernel)
         # A function of its own: of the same one JAX would take what it traced for another kernel.
         gain = jax.jit(lambda *arguments: log_likelihood_gain.__wrapped__(*arguments, WINDOW))
-        scenes, ancestor = pad_scene(image.bare_depth[None], WINDOW), jnp.zeros(len(placements.x), jnp.int32)
+        scenes, ancestor = pad_scene(jnp.asarray(image.bare_depth)[None], WINDOW), jnp.zeros(len(placements.x), jnp.int32)
         return np.asarray(gain(placements, ancestor, scenes, image, arrays, table, NOISE))
 
 
@@ -106,7 +106,7 @@ def test_hypotheses_gain_the_same(images, placements, arrays, table, kernel):
 
 def test_scenes_are_drawn_and_scored_the_same(images, placements, arrays, table):
     def scenes(image):
-        start = jnp.stack([pad_scene(image.bare_depth, WINDOW)] * len(placements.x))
+        start = jnp.stack([pad_scene(jnp.asarray(image.bare_depth), WINDOW)] * len(placements.x))
         return draw_objects(placements, start, image, arrays, table, WINDOW)
 
     tight, padded = scenes(images.tight), scenes(images.padded)

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.likelihood import reference
+from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.reference import render
 from bayes3d_ros.objects.library_arrays import OFFSET_RANGE
 

@@ -204,6 +204,7 @@ def test_a_plain_array_is_refused(tmp_path):
         ({"meta": np.frombuffer(b"[1]", np.uint8)}, "meta"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_fields_are_named(model, tmp_path, changes, reason):
     path = save_model(model, tmp_path)
     rewrite(path, **changes)
@@ -226,6 +227,7 @@ def test_wrong_fields_are_named(model, tmp_path, changes, reason):
         ({"provenance": 3}, "provenance must be"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_wrong_meta_is_named(model, tmp_path, changes, reason):
     path = save_model(model, tmp_path)
     rewrite(path, meta=meta_of(path, **changes))
@@ -243,6 +245,7 @@ def test_wrong_meta_is_named(model, tmp_path, changes, reason):
         ({"origin": np.zeros(4)}, "origin must have shape"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_models_are_checked_when_made(model, changes, reason):
     with pytest.raises(ValueError, match=reason):
         dataclasses.replace(model, **changes)

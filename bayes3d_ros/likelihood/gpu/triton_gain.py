@@ -15,7 +15,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_kind, outlier_density, ray_mixture
+from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_pixel_class, outlier_density, ray_mixture
 from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
 from bayes3d_ros.likelihood.march import (
     MOST_STEPS,
@@ -254,7 +254,7 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
     def log_of(pixels: Pixels, rendered: Any, sigma: Array) -> Float[Array, "B P"]:
         density, seen = ray_mixture(rendered, pixels, sigma, shape.window)
         inlier = jnp.where(seen, density, outlier_density(pixels))
-        outlier, inlier = by_kind(pixels, rendered(0, 0), inlier)
+        outlier, inlier = by_pixel_class(pixels, rendered(0, 0), inlier)
         return jnp.log(p * outlier[:, None] + (1 - p) * inlier[:, None])
 
     def look(k: Array, total: Float[Array, "P"], sigma: Array) -> Float[Array, "P"]:
