@@ -19,7 +19,7 @@ def direction(
     return np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
 
 
-def look_at(eye: Float[np.ndarray, "*n 3"], target: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
+def look_at(eye: Float[np.ndarray, "... 3"], target: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4 4"]:
     """T_world_camera of a camera at `eye` whose optical axis meets `target`, its image upright where z is up. Raises
     ValueError where neither is so."""
     z = target - eye

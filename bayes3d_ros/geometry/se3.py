@@ -5,7 +5,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 
-def product(A: Float[Array, "... 4 4"], B: Float[Array, "... 4 4"]) -> Float[Array, "... 4 4"]:
+def product(A: Float[Array, "... a b"], B: Float[Array, "... b c"]) -> Float[Array, "... a c"]:
     """Of matrices; batches broadcast. Written out: a multiplication may run at reduced precision on some backends."""
     return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 

@@ -20,7 +20,7 @@ from bayes3d_ros.io.bags import BagDamage, BagError, BagWriter, raw_messages, re
 INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, 64, 48)
 START = 1_700_000_000 * 10**9
 STORE = get_typestore(Stores.ROS2_JAZZY)
-BUNDLED = Path(__file__).parents[1] / "bags"
+BUNDLED = Path(__file__).parents[2] / "bags"
 
 
 def frame(index=0, intrinsics=INTRINSICS, pose=True):

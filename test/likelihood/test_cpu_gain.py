@@ -73,12 +73,13 @@ def test_depth_goes_into_the_images_that_there_are(drawn, marched, image, arrays
 @pytest.mark.parametrize("window", [1, 3, 5, 7])
 def test_every_window(window, drawn, image, arrays):
     """Over a scene, which the hypotheses hide in part; what they are compared with is drawn by the kernel itself."""
-    scene = np.full((1, HEIGHT, WIDTH), np.inf, np.float32)
-    scene[:, :, WIDTH // 2 :] = 0.52
-    scenes = SceneDepths(pad_scene(jnp.asarray(scene), window), jnp.zeros(COUNT, jnp.int32))
+    scene = jnp.full((1, HEIGHT, WIDTH), jnp.inf).at[:, :, WIDTH // 2 :].set(0.52)
+    scenes = SceneDepths(pad_scene(scene, window), jnp.zeros(COUNT, jnp.int32))
     gain = np.asarray(compiled_gain(drawn, scenes, image, arrays, NOISE, window))
     depth = jnp.minimum(compiled_depth(drawn, None, image, arrays), scene)
-    after, before = (log_likelihood_scene(pad_scene(jnp.asarray(d), window), image, NOISE, window) for d in (depth, scene))
+    after, before = (
+        log_likelihood_scene(pad_scene(d, window), image, NOISE, window) for d in (depth, jnp.asarray(scene))
+    )
     assert np.ptp(np.asarray(after)[:, 0, 0]) > 100
     np.testing.assert_allclose(gain, np.asarray(after - before), atol=0.02, rtol=2e-5)
 

@@ -89,7 +89,8 @@ def gains(kernel, placements, image, arrays, table):
         patch.setattr(scene_score, "kernel", lambda image: kernel)
         # A function of its own: of the same one JAX would take what it traced for another kernel.
         gain = jax.jit(lambda *arguments: log_likelihood_gain.__wrapped__(*arguments, WINDOW))
-        scenes, ancestor = pad_scene(jnp.asarray(image.bare_depth)[None], WINDOW), jnp.zeros(len(placements.x), jnp.int32)
+        scenes = pad_scene(jnp.asarray(image.bare_depth)[None], WINDOW)
+        ancestor = jnp.zeros(len(placements.x), jnp.int32)
         return np.asarray(gain(placements, ancestor, scenes, image, arrays, table, NOISE))
 
 
