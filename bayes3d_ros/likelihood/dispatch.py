@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 import jax
 from jaxtyping import Array, Float
 
+from bayes3d_ros.likelihood.cpu.call_frame import readable
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -30,11 +31,11 @@ class Gain(Protocol):
 
 def kernel(image: ScoredImage) -> Gain | None:
     """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
-    tile (`tiled_render.py`): free points, other backends."""
+    tile (`tiled_render.py`): free points, other backends, a CPU whose call frames the kernel cannot read."""
     if image.likelihood.name != "depth" or image.points is not None:
         return None
     backend = jax.default_backend()
-    if backend == "cpu":
+    if backend == "cpu" and readable():
         from bayes3d_ros.likelihood.cpu.gain import compiled_gain  # either takes a while to import
 
         return compiled_gain
@@ -46,8 +47,9 @@ def kernel(image: ScoredImage) -> Gain | None:
 
 
 def depth_kernel() -> Callable[..., Array] | None:
-    """`compiled_depth` on CPUs. On others None: there the walk of `rendering/` does as well."""
-    if jax.default_backend() != "cpu":
+    """`compiled_depth` on CPUs. Elsewhere, and where it cannot read XLA's call frames, None: the walk of `march.py`
+    does as well."""
+    if jax.default_backend() != "cpu" or not readable():
         return None
     from bayes3d_ros.likelihood.cpu.gain import compiled_depth
 

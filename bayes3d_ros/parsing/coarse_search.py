@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from bayes3d_ros.likelihood.cpu.call_frame import readable
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
@@ -140,7 +141,7 @@ def score_cells(
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
     """Sketch scores of all cells, -inf where not searched: on CPUs by compiled loops."""
-    if jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu" or not readable():
         return cells_in_turn(centres, count, evidence, image, library, table)
     from bayes3d_ros.parsing.coarse_search_cpu import sketch_scores  # takes a while to import
 

@@ -1,7 +1,7 @@
 """XLA's foreign functions written in numba: what a compiled function finds in the call frame that XLA hands it.
 
-The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()), version 0.1 and later
-ones of version 0: structs are looked at as arrays of 64-bit words.
+The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()): structs are looked at as
+arrays of 64-bit words. Whoever calls these functions has asked `call_frame.readable` before.
 """
 
 import ctypes
@@ -12,11 +12,11 @@ import numpy as np
 from numba import carray, njit, types
 from numba.extending import intrinsic
 
-_FRAME, _EXTENSION, _ARGUMENTS, _RESULTS = 17, 1, 9, 14  # words of XLA_FFI_CallFrame, and places in it
+from bayes3d_ros.likelihood.cpu.call_frame import ARGUMENTS_WORD, METADATA, RESULTS_WORD, VERSION, VERSION_WORD
+
+_FRAME, _EXTENSION = 17, 1  # words of XLA_FFI_CallFrame, and a place in it
+_ARGUMENTS, _RESULTS = ARGUMENTS_WORD + 4, RESULTS_WORD + 4  # where in the frame the arrays of buffers are
 _BUFFER, _DATA, _RANK, _DIMS = 6, 3, 4, 5  # of XLA_FFI_Buffer
-_METADATA = 1  # the type of the extension that asks for the version
-_VERSION_AT = 24  # bytes into XLA_FFI_Metadata
-_VERSION = (0, 1)
 
 
 @intrinsic
@@ -39,10 +39,10 @@ def answered_version(frame):
     if extension == 0:
         return False
     fields = _words(extension, 4)  # size, type (32 bits), next, metadata
-    if (fields[1] & 0xFFFFFFFF) != _METADATA:
+    if (fields[1] & 0xFFFFFFFF) != METADATA:
         return False
-    version = carray(_pointer(fields[3] + _VERSION_AT), (2,), np.int32)
-    version[0], version[1] = _VERSION
+    version = carray(_pointer(fields[3] + 8 * VERSION_WORD), (2,), np.int32)
+    version[0], version[1] = VERSION
     return True
 
 
