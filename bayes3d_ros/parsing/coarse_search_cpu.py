@@ -1,7 +1,4 @@
-"""The coarse level of the search (`coarse_search.py`) by loops that numba compiles, for CPUs.
-
-All that is compiled stands in this file: numba looks no further to see whether what it has on disk is up to date.
-"""
+"""The coarse level of the search (`coarse_search.py`) by loops that numba compiles, for CPUs."""
 
 from typing import NamedTuple
 
@@ -9,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numba import cfunc, njit, types
 
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
 _TARGET = "bayes3d_sketch_scores"  # to XLA
@@ -18,9 +15,6 @@ _AT_ONCE = 8  # sketches: their points stay in the first-level cache, and are a 
 _NEAREST, _FARTHEST = 0.02, 1e6  # metres
 
 f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/loops.py`
-_FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
-_allocates = njit(cache=True, nogil=True, error_model="numpy")
-_lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
 
 
 def sketch_scores(
@@ -77,13 +71,13 @@ class _Points(NamedTuple):
     explained: Float[np.ndarray, "S"]
 
 
-@_allocates
+@allocating
 def _new_points(size):
     real = np.zeros(size, np.float32)
     return _Points(np.zeros(size, np.int32), real, real.copy(), real.copy(), real.copy(), real.copy())
 
 
-@_lanes
+@fast
 def _project(point, normal, first, count, stride, x0, y0, z0, image, points):
     """The pixels that points fall into, moved by (x0, y0, z0)."""
     zero, one, half = f32(0.0), f32(1.0), f32(0.5)
@@ -107,7 +101,7 @@ def _project(point, normal, first, count, stride, x0, y0, z0, image, points):
         area[k] = facing * inverse * inverse if seen else zero
 
 
-@_lanes
+@fast
 def _look_up(image, points, count):
     pixel, observed, unexplained, explained = points.pixel, points.observed, points.unexplained, points.explained
     for k in range(u64(count)):
@@ -115,7 +109,7 @@ def _look_up(image, points, count):
         observed[k], unexplained[k], explained[k] = image.depth[at], image.unexplained[at], image.explained[at]
 
 
-@_lanes
+@fast
 def _weigh(image, points, count):
     """What each point counts, for or against, in place of its area."""
     zero, one = f32(0.0), f32(1.0)
@@ -134,7 +128,7 @@ def _weigh(image, points, count):
         area[k] = (matched - image.penalty * through) * area[k] if observed[k] > zero else zero
 
 
-@_lanes
+@fast
 def _sum(area, first, count):
     total, first = f32(0.0), u64(first)
     for k in range(first, first + u64(count)):
@@ -142,7 +136,7 @@ def _sum(area, first, count):
     return total
 
 
-@_lanes
+@fast
 def _score(point, normal, worth, moved, image, types, ways, size, count, num_types, points, scores):
     for k in range(u64(len(scores))):
         scores[k] = f32(-np.inf)
@@ -163,7 +157,7 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
                     scores[to + k] = worth[type_id] * _sum(points.area, k * size, size)
 
 
-@cfunc(types.int64(types.int64), cache=True)
+@handler
 def _sketch(frame):
     """See `sketch_scores`."""
     if answered_version(frame):

@@ -3,8 +3,6 @@
 Rays of a hypothesis walk side by side (`Lanes`): every loop over lanes is plain arithmetic, of which LLVM makes vector
 instructions, and what they look up is fetched in a loop of its own. Rays that have ended make room. The walk is that
 of `likelihood/march.py`, the densities are those of `density.py`, written again in scalars; tests compare.
-
-All that is compiled stands in this file: numba looks no further to see whether what it has on disk is up to date.
 """
 
 from typing import NamedTuple
@@ -12,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from llvmlite import ir
-from numba import cfunc, njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler, inlined, strict
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 from bayes3d_ros.likelihood.density import BEYOND, FAR_AWAY, IN_WORKSPACE, LATERAL
 from bayes3d_ros.likelihood.march import MOST_STEPS, NEAR, NUDGE
@@ -44,17 +43,6 @@ _SIDES = 4 * len(_SLOPES)
 _SETS = (np.arange(256)[:, None] >> np.arange(_VECTOR)) & 1
 _ORDERS = np.argsort(1 - _SETS, axis=1, kind="stable").astype(np.int32).ravel()
 _MEMBERS = _SETS.sum(1).astype(np.uint64)
-
-# NaN and inf are kept out before; sums may be taken in any order.
-_FAST = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
-_allocates = njit(cache=True, nogil=True, error_model="numpy")
-# Where nothing is allocated references need no counting, which takes as long as a short loop.
-_whole = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
-_lanes = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST)  # type: ignore[call-overload]
-# A call takes as long as a step of a few rays.
-_within = njit(  # type: ignore[call-overload]
-    cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FAST, inline="always"
-)
 
 
 class Lanes(NamedTuple):
@@ -198,7 +186,7 @@ def _pack(context, array, first, orders, bits, target, to):
     return types.void(array, first, orders, bits, target, to), generate
 
 
-@_lanes
+@fast
 def _exp(x):
     """exp of x <= 0, to 1e-5 of it; below -87 as at -87 (1.6e-38)."""
     x = max(x, f32(-87.0))
@@ -214,7 +202,7 @@ def _exp(x):
     return p * _bits_as_float(i32((n + i32(127)) << i32(23)))
 
 
-@_lanes
+@fast
 def _log(x):
     """log of x > 0, to 3e-7 (absolute, or relative where it is large)."""
     bits = _float_as_bits(x)
@@ -232,19 +220,19 @@ def _log(x):
     return f32(exponent) * f32(0.69314718) + s * series
 
 
-@_whole
+@strict
 def _whole_vectors(count):
     """So many lanes, and those that fill the last vector."""
     return (count + _VECTOR - 1) // _VECTOR * _VECTOR
 
 
-@_lanes
+@fast
 def _cell(eye, d, at, n):
     """The cell, as a float, that a ray is in along one axis."""
     return f32(i32(min(max(eye + at * d, f32(0.0)), n - f32(1.0))))
 
 
-@_lanes
+@fast
 def _enter(grid, turn, lanes, first, last):
     """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the grid."""
     tiny, zero = f32(1e-6), f32(0.0)
@@ -267,7 +255,7 @@ def _enter(grid, turn, lanes, first, last):
         t[k] = max(enter, f32(NEAR)) + f32(NUDGE) * min(abs(ia), min(abs(ib), abs(ic)))
 
 
-@_within
+@inlined
 def _find(grid, lanes, count):
     """The voxels that rays are in: where in the words they are, and the eye from their middles. Rays that have ended
     are in any voxel."""
@@ -285,14 +273,14 @@ def _find(grid, lanes, count):
         word[k] = grid.first + octant * grid.voxels + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
 
 
-@_within
+@inlined
 def _look_up(words, lanes, count):
     word = lanes.word
     for k in range(u64(count)):
         word[k] = words[u64(word[k])]
 
 
-@_within
+@inlined
 def _advance(lanes, count):
     """One step of every ray: test its voxel, and go on to where the empty box ahead of it ends. A ray that has met a
     surface at depth z holds -z from then on."""
@@ -322,7 +310,7 @@ def _advance(lanes, count):
         t[k] = then if (at >= f32(0.0) and at < leave[k]) else at
 
 
-@_within
+@inlined
 def _place_rays(ray_x, first, count, y, pixel, lanes, used):
     """Rays of a few pixels of a row into the lanes after those in use."""
     x, dy, place = lanes.x, lanes.y, lanes.pixel
@@ -331,7 +319,7 @@ def _place_rays(ray_x, first, count, y, pixel, lanes, used):
         x[used + k], dy[used + k], place[used + k] = ray_x[first + k], y, i32(pixel + k)
 
 
-@_within
+@inlined
 def _make_room(lanes, count, met, patch):
     """Put down what has been met, and move the rays that go on together."""
     dx, dy, dz, t, leave, pixel = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
@@ -356,7 +344,7 @@ def _make_room(lanes, count, met, patch):
     return np.int64(kept)
 
 
-@_lanes
+@fast
 def _walk(words, grid, lanes, count, most, met, patch):
     """The rays in the first lanes until at most so many are left; depth goes into the patch where it is nearer than
     what is there. Returns how many are left."""
@@ -449,7 +437,7 @@ class Windows(NamedTuple):
     weight: Float[np.ndarray, "w"]
 
 
-@_allocates
+@allocating
 def _new_lanes(count):
     """Lanes whose rays have left."""
     one = np.ones(count, np.float32)
@@ -458,7 +446,7 @@ def _new_lanes(count):
     return Lanes(one, one.copy(), one.copy(), here, nowhere, zeros, zeros.copy(), here.copy(), here.copy(), here.copy())
 
 
-@_allocates
+@allocating
 def _new_space(height, width, border, objects, corners):
     pixels = (height + 2 * border) * (width + 2 * border) + _VECTOR
     nothing, none, flags = np.full(pixels, f32(_NOTHING)), np.zeros(pixels, np.int32), np.zeros(pixels, np.uint8)
@@ -489,7 +477,7 @@ def _new_space(height, width, border, objects, corners):
     )
 
 
-@_allocates
+@allocating
 def _new_windows(points):
     zeros = np.zeros(_WIDE, np.float32)
     return Windows(
@@ -508,7 +496,7 @@ def _new_windows(points):
     )
 
 
-@_lanes
+@fast
 def _project(corners, count, pose, picture, corner_u, corner_v):
     """Where corners are in the image. Returns the least and the largest of depth, column and row."""
     most = u64(len(corners) // 3)
@@ -527,7 +515,7 @@ def _project(corners, count, pose, picture, corner_u, corner_v):
     return near, far, left, right, top, bottom
 
 
-@_lanes
+@fast
 def _ends(u, v, slope, count):
     """The least and the largest u + slope v, and u - slope v."""
     low, high, other_low, other_high = _INF, -_INF, _INF, -_INF
@@ -538,7 +526,7 @@ def _ends(u, v, slope, count):
     return low, high, other_low, other_high
 
 
-@_whole
+@strict
 def _outline(pose, corners, count, picture, k, space):
     """Finds object k's outline. Returns the first and one past the last column and row that it may cover, none where
     it lies behind the camera; and whether some of it does."""
@@ -563,7 +551,7 @@ def _outline(pose, corners, count, picture, k, space):
     return (int(max(left, 0.0)), int(min(right, width)), int(max(top, 0.0)), int(min(bottom, height))), False
 
 
-@_lanes
+@fast
 def _cut_rows(sides, first, last, left, right):
     """Where an outline begins and ends in each of some rows."""
     first, last = u64(first), u64(last)
@@ -578,13 +566,13 @@ def _cut_rows(sides, first, last, left, right):
             right[row] = min(right[row], min(high - rise, other_high + rise))
 
 
-@_lanes
+@fast
 def _eye(pose, origin, axis):
     """Where the camera is in the grid, along an axis, in metres."""
     return -(pose[axis] * pose[3] + pose[4 + axis] * pose[7] + pose[8 + axis] * pose[11]) - origin[axis]
 
 
-@_within
+@inlined
 def _draw_object(things, thing, k, picture, patch, stride, shift, space):
     """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
     type_id, pose, turn, lanes = (
@@ -639,7 +627,7 @@ def _draw_object(things, thing, k, picture, patch, stride, shift, space):
     _walk(things.words, grid, lanes, used, 0, space.met, patch)
 
 
-@_lanes
+@fast
 def _draw_plane(normal, offset, ray_x, y, patch, at):
     """A row of the plane's depth (`likelihood/plane.py`)."""
     at = u64(at)
@@ -650,7 +638,7 @@ def _draw_plane(normal, offset, ray_x, y, patch, at):
         patch[at + k] = depth if (towards and depth > f32(0.0)) else f32(_NOTHING)
 
 
-@_within
+@inlined
 def _copy_scene(scenes, scene_at, count, before, patch, at):
     """A row of what is there before; inf becomes _NOTHING."""
     scene_at, at = u64(scene_at), u64(at)
@@ -660,7 +648,7 @@ def _copy_scene(scenes, scene_at, count, before, patch, at):
         patch[at + k] = depth
 
 
-@_within
+@inlined
 def _copy_returns(picture, pixel, count, depth, pixel_class, at):
     """A row of the observed image."""
     every_depth, every_class = picture.depth, picture.pixel_class
@@ -670,7 +658,7 @@ def _copy_returns(picture, pixel, count, depth, pixel_class, at):
         pixel_class[at + k] = every_class[pixel + k]
 
 
-@_lanes
+@fast
 def _mark(patch, before, size, changed):
     """Where the hypothesis changes the patch; the least and the largest depth there."""
     low, high = f32(_NOTHING), f32(0.0)
@@ -682,7 +670,7 @@ def _mark(patch, before, size, changed):
     return low, high
 
 
-@_whole
+@strict
 def _windows_with(flags, size, stride, border, wider, seen):
     """Pixels in whose windows there is a flag: along rows, then along columns. The border has neither flags nor pixels,
     so that it does not matter where a row ends."""
@@ -691,7 +679,7 @@ def _windows_with(flags, size, stride, border, wider, seen):
     _either(wider, first, last, stride, border, seen)
 
 
-@_lanes
+@fast
 def _either(flags, first, last, step, border, found):
     """found[k]: a flag at k or up to `border` steps to either side."""
     first, last, step = u64(first), u64(last), u64(step)
@@ -714,7 +702,7 @@ def _either(flags, first, last, step, border, found):
                 found[k] |= flags[k - u64(apart) * step] | flags[k + u64(apart) * step]
 
 
-@_lanes
+@fast
 def _sort(space, first, last, low, high, front_margin):
     """Pixels that the hypothesis changes: how many have windows to be looked at (`close`), how many are too far from
     every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
@@ -739,7 +727,7 @@ def _sort(space, first, last, low, high, front_margin):
     return near, count - near, hidden
 
 
-@_lanes
+@fast
 def _begin_ends(patch, size, low, high):
     """Depth of surfaces, as the least and the largest."""
     for k in range(u64(size)):
@@ -747,7 +735,7 @@ def _begin_ends(patch, size, low, high):
         low[k], high[k] = depth, depth if depth < f32(_NOTHING) else f32(0.0)
 
 
-@_lanes
+@fast
 def _widen_ends(low, high, first, last, step, border, least, most):
     """The least and the largest up to `border` steps to either side."""
     first, last, step = u64(first), u64(last), u64(step)
@@ -770,7 +758,7 @@ def _widen_ends(low, high, first, last, step, border, least, most):
                 most[k] = max(most[k], max(high[k - away], high[k + away]))
 
 
-@_lanes
+@fast
 def _sort_again(space, first, last, metres, share):
     """Of the pixels whose windows were to be looked at, those that are not too far from every surface of their own
     window; how many the others are."""
@@ -785,7 +773,7 @@ def _sort_again(space, first, last, metres, share):
     return left_out
 
 
-@_lanes
+@fast
 def _list(close, first, last, listed):
     """The places of pixels whose windows are to be looked at."""
     used = u64(0)
@@ -795,7 +783,7 @@ def _list(close, first, last, listed):
     return np.int64(used)
 
 
-@_whole
+@strict
 def _begin_windows(picture, space, first, count, stride, left, top, windows):
     """The windows of some listed pixels; beyond the last, its own again. (left, top) is the pixel at place 0."""
     for k in range(_whole_vectors(count)):
@@ -808,7 +796,7 @@ def _begin_windows(picture, space, first, count, stride, left, top, windows):
         windows.outlier[k] = picture.outlier_scale * z * z
 
 
-@_within
+@inlined
 def _pick_points(image, offset, windows, to, full):
     place, point = windows.place, windows.point
     to = u64(to)
@@ -816,7 +804,7 @@ def _pick_points(image, offset, windows, to, full):
         point[to + k] = image[u64(place[k] + offset)]
 
 
-@_within
+@inlined
 def _measure(windows, to, ex, ey, full):
     """Squared distances of a point of every window from the ray of its middle, and along it."""
     depth, x, y, norm2, nearest = windows.depth, windows.x, windows.y, windows.norm2, windows.nearest
@@ -834,7 +822,7 @@ def _measure(windows, to, ex, ey, full):
         nearest[k] = min(nearest[k], apart)
 
 
-@_within
+@inlined
 def _weigh(windows, to, scale, full):
     """A point of every window into the mixtures."""
     across, along, nearest, both, weight = (
@@ -852,7 +840,7 @@ def _weigh(windows, to, scale, full):
         weight[k] += w
 
 
-@_within
+@inlined
 def _odds(windows, norm, count, odds, to):
     """Inliers' densities over outliers': of the mixture, 1 where a window holds no surface, and beyond the last."""
     outlier, norm2, nearest, both, weight = (
@@ -868,13 +856,13 @@ def _odds(windows, norm, count, odds, to):
         odds[to + k] = mixture if (nearest[k] < f32(FAR_AWAY) and k < u64(count)) else f32(1.0)
 
 
-@_lanes
+@fast
 def _fill(array, count, value):
     for k in range(u64(count)):
         array[k] = value
 
 
-@_lanes
+@fast
 def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
     """Densities of inliers over those of outliers at every sigma, of the windows' points in an image."""
     full = _whole_vectors(count)
@@ -895,7 +883,7 @@ def _mixtures(image, stride, border, picture, sigma, windows, count, odds):
         _odds(windows, f32(1.0) / (f32(2.50662827) * sigma[s]), count, odds, s * _WIDE)
 
 
-@_lanes
+@fast
 def _sum_of_logs(p, odds, at):
     """Sum over pixels of log(p + (1 - p) odds), through the logs of products of four."""
     total, rest = f32(0.0), f32(1.0) - p
@@ -907,7 +895,7 @@ def _sum_of_logs(p, odds, at):
     return total
 
 
-@_within
+@inlined
 def _outlines(things, n, objects, picture, space):
     """Finds where a hypothesis' objects are in the image. Returns the rectangle around them."""
     u0, u1, v0, v1, corners = len(picture.ray_x), 0, len(picture.ray_y), 0, _most_corners(things)
@@ -929,20 +917,20 @@ def _outlines(things, n, objects, picture, space):
     return u0, u1, v0, v1
 
 
-@_within
+@inlined
 def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
     """The objects whose outlines have been found, into a patch that holds them."""
     for k in range(objects):
         _draw_object(things, n * objects + k, k, picture, patch, stride, shift, space)
 
 
-@_whole
+@strict
 def _draw_planes(plane, picture, patch, stride, shift):
     for v in range(len(picture.ray_y)):
         _draw_plane(plane, plane[3], picture.ray_x, picture.ray_y[v], patch, v * stride + shift)
 
 
-@_whole
+@strict
 def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
     """What is there before, and what was observed, in a patch around a rectangle. Returns the patch' stride and size,
     and its first column and row in the image, which may lie outside by half a window."""
@@ -970,7 +958,7 @@ def _begin(picture, scenes, scene_at, scene_stride, rectangle, border, space):
     return stride, size, left - border, top - border
 
 
-@_whole
+@strict
 def _gains(
     things, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier, weight, window, everywhere, metres, share,
     gain, space, windows, now, former
@@ -1023,7 +1011,7 @@ def _gains(
                 gain[n * levels + level] += weight * told
 
 
-@_whole
+@strict
 def _depths(things, planes, picture, start, rows, columns, border, everywhere, depth, space):
     """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
     with, or none, and what each hypothesis adds."""
@@ -1042,24 +1030,24 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 
 
-@_whole
+@strict
 def _objects(things, planes):
     """How many objects a hypothesis has; every hypothesis has one plane."""
     return len(things.type_id) // max(len(planes) // 4, 1)
 
 
-@_whole
+@strict
 def _most_corners(things):
     """How many corners of a hull there is room for."""
     return len(things.hull_corner) // (3 * len(things.hull_count))
 
 
-@_whole
+@strict
 def _is_plane(plane):
     return abs(plane[0] + plane[1] + plane[2] + plane[3]) < _NOTHING  # not NaN
 
 
-@_whole
+@strict
 def _things(frame):
     """The first nine arguments of both targets."""
     return Things(
@@ -1068,7 +1056,7 @@ def _things(frame):
     )  # fmt: skip
 
 
-@cfunc(types.int64(types.int64), cache=True)
+@handler
 def _gain(frame):
     """See `compiled_gain.compiled_gain`."""
     if answered_version(frame):
@@ -1092,7 +1080,7 @@ def _gain(frame):
     return 0
 
 
-@cfunc(types.int64(types.int64), cache=True)
+@handler
 def _depth(frame):
     """See `compiled_gain.compiled_depth`."""
     if answered_version(frame):

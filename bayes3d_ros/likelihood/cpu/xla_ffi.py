@@ -13,6 +13,7 @@ from numba import carray, njit, types
 from numba.extending import intrinsic
 
 from bayes3d_ros.likelihood.cpu.call_frame import ARGUMENTS_WORD, METADATA, RESULTS_WORD, VERSION, VERSION_WORD
+from bayes3d_ros.likelihood.cpu.compiling import kept
 
 _FRAME, _EXTENSION = 17, 1  # words of XLA_FFI_CallFrame, and a place in it
 _ARGUMENTS, _RESULTS = ARGUMENTS_WORD + 4, RESULTS_WORD + 4  # where in the frame the arrays of buffers are
@@ -27,12 +28,12 @@ def _pointer(context, address):
     return types.voidptr(types.int64), generate
 
 
-@njit("int64[::1](int64, int64)", cache=True)
+@kept(njit("int64[::1](int64, int64)", cache=True))
 def _words(address, count):
     return carray(_pointer(address), (count,), np.int64)
 
 
-@njit("boolean(int64)", cache=True)
+@kept(njit("boolean(int64)", cache=True))
 def answered_version(frame):
     """Whether XLA only asks which version of its interface this is; then it has been told."""
     extension = _words(frame, _FRAME)[_EXTENSION]
@@ -46,7 +47,7 @@ def answered_version(frame):
     return True
 
 
-@njit("UniTuple(int64, 2)(int64, int64, int64)", cache=True)
+@kept(njit("UniTuple(int64, 2)(int64, int64, int64)", cache=True))
 def _buffer(frame, where, k):
     """Address and number of elements of the k-th argument or result."""
     buffer = _words(_words(_words(frame, _FRAME)[where], k + 1)[k], _BUFFER)
@@ -56,21 +57,21 @@ def _buffer(frame, where, k):
     return buffer[_DATA], count
 
 
-@njit("float32[::1](int64, int64)", cache=True)
+@kept(njit("float32[::1](int64, int64)", cache=True))
 def floats(frame, k):
     """The k-th argument, an array of float32, flat."""
     address, count = _buffer(frame, _ARGUMENTS, k)
     return carray(_pointer(address), (count,), np.float32)
 
 
-@njit("int32[::1](int64, int64)", cache=True)
+@kept(njit("int32[::1](int64, int64)", cache=True))
 def integers(frame, k):
     """The k-th argument, an array of int32, flat."""
     address, count = _buffer(frame, _ARGUMENTS, k)
     return carray(_pointer(address), (count,), np.int32)
 
 
-@njit("float32[::1](int64, int64)", cache=True)
+@kept(njit("float32[::1](int64, int64)", cache=True))
 def float_results(frame, k):
     """The k-th result, an array of float32, flat."""
     address, count = _buffer(frame, _RESULTS, k)
@@ -78,6 +79,6 @@ def float_results(frame, k):
 
 
 def register(name: str, compiled: Any) -> None:
-    """Make a `numba.cfunc` of int64(int64), frame to error, known to XLA on CPUs under a name."""
+    """Make a compiled `handler` known to XLA on CPUs under a name."""
     capsule = jax.ffi.pycapsule(ctypes.cast(compiled.address, ctypes.c_void_p))
     jax.ffi.register_ffi_target(name, capsule, platform="cpu")

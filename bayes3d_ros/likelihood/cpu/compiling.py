@@ -1,0 +1,78 @@
+"""How the loops are compiled by numba, and how its cache on disk is kept from being out of date.
+
+numba takes compiled code on disk for up to date as long as the function's own file has not changed. But compiled code
+holds functions and constants of other files too, and cached types are looked up by name in classes that may be gone. So
+a stamp of all these sources is a part of every function's name, and with it of the names of its files in the cache.
+Files of other sources are not read, whatever is in them; processes of different sources do not disturb each other, and
+nothing of this needs a folder that can be written. Such files are removed where that is possible.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+from numba import cfunc, njit, types
+
+_PACKAGE = Path(__file__).parents[2]
+# Files of all functions that are compiled, and of constants that they use.
+SOURCES = (
+    "likelihood/cpu/*.py",
+    "likelihood/density.py",
+    "likelihood/march.py",
+    "likelihood/tiles.py",
+    "objects/library_arrays.py",
+    "parsing/coarse_search_cpu.py",
+)
+# NaN and inf are kept out before; sums may be taken in any order.
+_FASTMATH = {"contract", "nsz", "arcp", "reassoc", "afn", "nnan"}
+
+
+def _sources() -> list[Path]:
+    return [path for pattern in SOURCES for path in sorted(_PACKAGE.glob(pattern))]
+
+
+def _stamp(paths: Iterable[Path]) -> str:
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    for path in paths:
+        with suppress(OSError):  # an installation without sources: numba itself cannot notice a change then
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _remove_others(paths: Iterable[Path], stamp: str) -> None:
+    """Remove from the folders beside the sources what numba has kept of other stamps."""
+    for path in paths:
+        for kept in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ci]"):
+            if stamp not in kept.name:
+                with suppress(OSError):  # a folder that cannot be written, or another process was faster
+                    kept.unlink()
+
+
+STAMP = _stamp(_sources())
+with suppress(OSError):
+    _remove_others(_sources(), STAMP)
+
+
+def kept(compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """A decorator of numba's, whose functions are kept on disk under their name and the stamp."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        function.__qualname__ += f"_{STAMP}"
+        return compiled(function)
+
+    return decorate
+
+
+allocating = kept(njit(cache=True, nogil=True, error_model="numpy"))
+# Where nothing is allocated references need no counting, which takes as long as a short loop.
+strict = kept(njit(cache=True, nogil=True, error_model="numpy", _nrt=False))  # type: ignore[call-overload]
+fast = kept(njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FASTMATH))  # type: ignore[call-overload]
+# Into the function that calls it: a call takes as long as a step of a few rays.
+inlined = kept(
+    njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FASTMATH, inline="always")  # type: ignore[call-overload]
+)
+handler = kept(cfunc(types.int64(types.int64), cache=True))  # of XLA's calls, frame to error

@@ -1,0 +1,98 @@
+"""What numba has kept on disk is not used when any of the sources behind it has changed."""
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bayes3d_ros
+from bayes3d_ros.likelihood.cpu import compiling
+
+PACKAGE = Path(bayes3d_ros.__file__).parent
+
+COMPILED = """
+from typing import NamedTuple
+import numpy as np
+from bayes3d_ros.likelihood.cpu.compiling import fast
+from bayes3d_ros.likelihood.density import LATERAL
+
+class Pair(NamedTuple):
+    one: float
+    other: float
+
+@fast
+def weighed(pair):
+    return (pair.one + pair.other) * np.float32(LATERAL)
+"""
+CALL = """
+from bayes3d_ros.likelihood.cpu.compiled_for_test import *
+print(weighed({}(1.0, 2.0)), sum(weighed.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy of the package that holds one more compiled function, of a constant of another file and a class."""
+    shutil.copytree(PACKAGE, tmp_path / "bayes3d_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "bayes3d_ros/likelihood/cpu/compiled_for_test.py").write_text(COMPILED)
+    return tmp_path / "bayes3d_ros"
+
+
+def told(copy, pair="Pair"):
+    """What the function returns in a process of its own, and how often it was found on disk."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
+    environment |= {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    call = [sys.executable, "-c", CALL.format(pair)]
+    done = subprocess.run(call, cwd=copy.parent, env=environment, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    value, hits = done.stdout.split()
+    return round(float(value), 3), int(hits)
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_a_constant_of_another_file_and_a_class_that_is_gone(copy):
+    assert told(copy) == (0.06, 0)
+    assert told(copy) == (0.06, 1)
+    edit(copy / "likelihood/density.py", "LATERAL = 0.02", "LATERAL = 0.05")
+    assert told(copy) == (0.15, 0)
+    folder = copy / "likelihood/cpu/__pycache__"
+    assert len(list(folder.glob("compiled_for_test.weighed_*.nbi"))) == 1  # that of before is gone
+    edit(copy / "likelihood/cpu/compiled_for_test.py", "Pair", "Both")
+    assert told(copy, "Both") == (0.15, 0)
+    assert told(copy, "Both") == (0.15, 1)
+
+
+def test_a_folder_that_cannot_be_written_does_no_harm(copy, monkeypatch):
+    old = copy / "likelihood/cpu/__pycache__/loops._exp_0123-1.py312.nbi"
+    old.parent.mkdir()
+    old.touch()
+
+    def refuse(path):
+        raise PermissionError(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        compiling._remove_others([copy / "likelihood/cpu/loops.py"], "4567")
+    assert old.exists()
+    compiling._remove_others([copy / "likelihood/cpu/loops.py"], "4567")
+    assert not old.exists()
+
+
+def test_the_stamp_covers_whatever_compiled_code_imports():
+    sources = {str(path.relative_to(PACKAGE)) for path in compiling._sources()}
+    compiled = [path for path in PACKAGE.rglob("*.py") if "likelihood.cpu.compiling import" in path.read_text()]
+    assert len(compiled) >= 3
+    for path in compiled:
+        imported = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ImportFrom)]
+        modules = [node.module for node in imported if node.module.startswith("bayes3d_ros.")]
+        needed = {m.removeprefix("bayes3d_ros.").replace(".", "/") + ".py" for m in modules}
+        assert {str(path.relative_to(PACKAGE)), *needed} <= sources
