@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bayes3d_ros.geometry.se3 import product
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
-from bayes3d_ros.likelihood.hypotheses import Drawn
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.plane import plane_depth
 from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
@@ -48,17 +48,17 @@ def log_likelihood_of_cameras(
     rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
     `image.bare_depth` is not used."""
     if gain := kernel(image):
-        return gain(_drawn(T_camera_world, world), None, image, library, noise, window)
+        return gain(_hypotheses(T_camera_world, world), None, image, library, noise, window)
     half = window // 2
     size = tile_size(image.depth.shape[1])
     count, objects = len(T_camera_world), len(world.type)
     T = product(T_camera_world[:, None], world.T_world_object)
     kinds = jnp.broadcast_to(world.type, (count, objects))
-    drawn, scored = (
+    covered, scored = (
         tiles_of_objects(T, kinds, image, library, grown, world.table_visible, size.tile) for grown in (0, half)
     )
 
-    def draw(n, rays):
+    def render(n, rays):
         return depth_along(T_camera_world[n], world, library, rays)
 
     def score(total, n, u, v, depth, real):
@@ -68,14 +68,14 @@ def log_likelihood_of_cameras(
         return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_depth(score, start, draw, drawn, scored, count, image, half, size)
+    return over_depth(score, start, render, covered, scored, count, image, half, size)
 
 
-def _drawn(T_camera_world: Float[Array, "N 4 4"], world: World) -> Drawn:
+def _hypotheses(T_camera_world: Float[Array, "N 4 4"], world: World) -> RenderedHypotheses:
     """The world as every camera sees it."""
     normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
     plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
-    return Drawn(
+    return RenderedHypotheses(
         type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
         T_camera_object=product(T_camera_world[:, None], world.T_world_object),
         plane=jnp.where(world.table_visible, plane, 0.0),
@@ -103,7 +103,7 @@ def render_cameras(
 ) -> Float[Array, "N H W"]:
     """What each camera sees in the pixels of an image."""
     if depth := depth_kernel():
-        return depth(_drawn(T_camera_world, world), None, image, library)
+        return depth(_hypotheses(T_camera_world, world), None, image, library)
     shape = (len(T_camera_world), *image.depth.shape)
     rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
     own = jnp.arange(shape[1])[:, None] < image.own_rows

@@ -8,19 +8,19 @@ from jaxtyping import Array, Float
 
 from bayes3d_ros.likelihood.cpu.call_frame import readable
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
 @runtime_checkable
 class Gain(Protocol):
-    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
     without scenes, nothing is there before."""
 
     def __call__(
         self,
-        drawn: Drawn,
+        hypotheses: RenderedHypotheses,
         scenes: SceneDepths | None,
         image: ScoredImage,
         library: LibraryArrays,

@@ -1,11 +1,11 @@
-"""What kernels are given: hypotheses of what is drawn into which scenes."""
+"""What kernels are given: hypotheses of what is rendered into which scenes."""
 
 from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
 
 
-class Drawn(NamedTuple):
+class RenderedHypotheses(NamedTuple):
     """What each of N hypotheses adds to its scene: K objects, and a plane."""
 
     type: Int[Array, "N K"]

@@ -23,7 +23,7 @@ _SIGMA_STEPS, _P_STEPS = 11, 17
 _SIGMA_FINE, _P_FINE = 24, 12  # fine points between coarse ones: 1 % of sigma, whose posterior may be half as narrow
 _NEAR = 5  # coarse sigmas that a search looks at
 _P_LOW, _P_HIGH = 2e-4, 0.9
-_PARTS = 5  # of a fine step, in which noise is drawn
+_PARTS = 5  # of a fine step, in which noise is sampled
 _DENSE = 4  # sigmas of a reference scene in a coarse step
 
 
@@ -170,10 +170,10 @@ def log_marginal(loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Float[A
 
 
 def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
-    """One draw of (sigma, p_outlier) per particle given its scene: sigma on the fine grid, p_outlier given it and then
-    sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough to
-    sum, but its step can be wider than a standard deviation of p_outlier: drawn evenly from it, 50 % intervals hold
-    58 %."""
+    """One sample of (sigma, p_outlier) per particle given its scene: sigma on the fine grid, p_outlier given it and
+    then sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough
+    to sum, but its step can be wider than a standard deviation of p_outlier: sampled evenly from it, 50 % intervals
+    hold 58 %."""
     s_key, p_key, sigma_key = jax.random.split(key, 3)
     s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(loglik_grid, grid), -1))
     exact = jax.lax.Precision.HIGHEST
@@ -181,7 +181,7 @@ def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGri
     given_sigma = jnp.einsum("ns,nsp->np", grid.to_fine_sigma[s], relative, precision=exact) + grid.sigma_error[s]
     ends_u, ends_v = jnp.log(grid.coarse.sigma), jnp.log(_odds(grid.coarse.p_outlier))
     # log(1 - p) of every return without the spline's error: its own spline taken out, itself put in.
-    part, v = _draw_along(
+    part, v = _sample_along(
         p_key,
         given_sigma + grid.returns * jax.nn.softplus(ends_v),
         ends_v,
@@ -191,14 +191,14 @@ def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGri
     to_p = jnp.asarray(_TO_P_PARTS)[part]
     given_p = jnp.einsum("np,nsp->ns", to_p, relative, precision=exact)
     missed = jnp.einsum("np,kp->nk", to_p, grid.sigma_error_parts, precision=exact)
-    _, u = _draw_along(sigma_key, given_p, ends_u, _TO_SIGMA_PARTS, lambda u: u + missed)
+    _, u = _sample_along(sigma_key, given_p, ends_u, _TO_SIGMA_PARTS, lambda u: u + missed)
     return Noise(jnp.exp(u), jax.nn.sigmoid(v))
 
 
-def _draw_along(
+def _sample_along(
     key: PRNGKeyArray, values: Float[Array, "N C"], axis: Float[Array, "C"], to_parts: np.ndarray, log_prior: Callable
 ) -> tuple[Int[Array, "N"], Float[Array, "N"]]:
-    """The part, and a place in it, of draws from exp(spline of the values on this axis) times the prior's density."""
+    """The part, and a place in it, of samples from exp(spline of the values on this axis) times the prior's density."""
     part_key, place_key = jax.random.split(key)
     step = (axis[-1] - axis[0]) / len(to_parts)
     middle = axis[0] + step * (jnp.arange(len(to_parts)) + 0.5)

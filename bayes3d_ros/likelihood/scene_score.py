@@ -9,10 +9,10 @@ from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import Noise, Pixels, log_likelihood
 from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
-from bayes3d_ros.likelihood.tiled_render import crop, draw_tiles, over_depth, padding
+from bayes3d_ros.likelihood.tiled_render import crop, over_depth, padding, render_tiles
 from bayes3d_ros.likelihood.tiles import LARGE, Tiles, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
@@ -23,25 +23,25 @@ def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*
     return jnp.pad(depth, pad, constant_values=jnp.inf)
 
 
-def _drawn(placement: Placement, library: LibraryArrays, table: Table) -> Drawn:
+def _hypotheses(placement: Placement, library: LibraryArrays, table: Table) -> RenderedHypotheses:
     """An object each."""
     T = T_camera_object(placement, library, table)
-    return Drawn(placement.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
+    return RenderedHypotheses(placement.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
 
 
-def _drawing(
+def _rendering(
     placement: Placement, image: ScoredImage, library: LibraryArrays, table: Table
 ) -> tuple[Callable, Callable]:
-    """Draws object n along rays; tiles of the objects' outlines, grown by so many pixels."""
+    """Renders object n along rays; tiles of the objects' outlines, grown by so many pixels."""
     T = T_camera_object(placement, library, table)
 
-    def draw(n, rays):
+    def render(n, rays):
         return march(library, placement.type[n], T[n], rays)
 
     def tiles(grown: int) -> Tiles:
         return tiles_of_objects(T[:, None], placement.type[:, None], image, library, grown)
 
-    return draw, tiles
+    return render, tiles
 
 
 def _twice(pixels: Pixels) -> Pixels:
@@ -72,10 +72,10 @@ def log_likelihood_gain(
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
     if gain_of := kernel(image):
-        drawn = _drawn(placement, library, table)
-        return gain_of(drawn, SceneDepths(scenes, ancestor), image, library, noise, window)
+        hypotheses = _hypotheses(placement, library, table)
+        return gain_of(hypotheses, SceneDepths(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
-    draw, tiles = _drawing(placement, image, library, table)
+    render, tiles = _rendering(placement, image, library, table)
 
     def add(gains, n, u, v, depth, real):
         before = crop(scenes, ancestor[n], u, v, tile + 2 * half)
@@ -87,11 +87,11 @@ def log_likelihood_gain(
 
     count = len(placement.type)
     gains = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_depth(add, gains, draw, tiles(0), tiles(half), count, image, half, LARGE)
+    return over_depth(add, gains, render, tiles(0), tiles(half), count, image, half, LARGE)
 
 
 @partial(jax.jit, static_argnames="window")
-def draw_objects(
+def render_objects(
     placement: Placement,
     scenes: Float[Array, "N Hp Wp"],
     image: ScoredImage,
@@ -101,11 +101,11 @@ def draw_objects(
 ) -> Float[Array, "N Hp Wp"]:
     """Scene n with object n rendered into it."""
     if depth := depth_kernel():
-        return depth(_drawn(placement, library, table), scenes, image, library, window // 2)
-    draw, tiles = _drawing(placement, image, library, table)
-    drawn = tiles(0)
-    each = drawn.u.shape[0] // len(scenes)
-    return draw_tiles(draw, scenes, drawn, (0, drawn.u.shape[0]), each, image, window // 2, LARGE)
+        return depth(_hypotheses(placement, library, table), scenes, image, library, window // 2)
+    render, tiles = _rendering(placement, image, library, table)
+    covered = tiles(0)
+    each = covered.u.shape[0] // len(scenes)
+    return render_tiles(render, scenes, covered, (0, covered.u.shape[0]), each, image, window // 2, LARGE)
 
 
 def log_likelihood_scene(

@@ -39,7 +39,7 @@ class ScoredImage(NamedTuple):
 
     @property
     def own_rows(self) -> Int[Array, ""] | np.int32 | int:
-        """How many rows the camera has: below them nothing was observed, and nothing is drawn."""
+        """How many rows the camera has: below them nothing was observed, and nothing is rendered."""
         return self.depth.shape[0] if self.rows is None else self.rows
 
 

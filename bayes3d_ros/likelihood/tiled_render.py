@@ -1,7 +1,7 @@
-"""Depth images of hypotheses, drawn and looked at a few at a time.
+"""Depth images of hypotheses, rendered and looked at a few at a time.
 
-Windows overlap: a tile's neighbours belong to the windows of its pixels too. So each hypothesis is drawn once, into an
-image of its own, and scored from there. The images of a batch fit into a cache, those of all would not fit anywhere.
+Windows overlap: a tile's neighbours belong to the windows of its pixels too. So each hypothesis is rendered once, into
+an image of its own, and scored from there. The images of a batch fit into a cache, those of all would not fit anywhere.
 For what the kernels do not do: free points, and backends other than CPUs and GPUs.
 """
 
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.tiles import Tiles, TileSize, over_tiles
 
-_BATCH_PIXELS = 1 << 20  # of the images that are drawn at a time
+_BATCH_PIXELS = 1 << 20  # of the images that are rendered at a time
 
 
 def padding(half: int, size: TileSize) -> tuple[int, int]:
@@ -23,8 +23,8 @@ def padding(half: int, size: TileSize) -> tuple[int, int]:
     return half, half + size.tile
 
 
-def draw_tiles(
-    draw: Callable,
+def render_tiles(
+    render: Callable,
     images: Float[Array, "B Hp Wp"],
     tiles: Tiles,
     rows,
@@ -33,8 +33,8 @@ def draw_tiles(
     half: int,
     size: TileSize,
 ) -> Float[Array, "B Hp Wp"]:
-    """Hypotheses drawn into padded images, each where it is nearer than what is there; draw(n, rays) gives depth along
-    rays (x, y, 1) of shape [h, w, chunk]. The first row's hypothesis is that of the first image."""
+    """Hypotheses rendered into padded images, each where it is nearer than what is there; render(n, rays) gives depth
+    along rays (x, y, 1) of shape [h, w, chunk]. The first row's hypothesis is that of the first image."""
     height, width = image.own_rows, image.depth.shape[1]
     step = jnp.arange(size.tile)[:, None]
     first = rows[0] // each
@@ -46,7 +46,8 @@ def draw_tiles(
         y = jnp.broadcast_to((row - image.centre[1]) / image.focal[1], shape)
         inside = real & (row < height) & (column < width)  # the image ends at its rim
         index = jnp.where(real, n - first, len(images))
-        return images.at[index, half + row, half + column].min(jnp.where(inside, draw(n, (x, y)), jnp.inf), mode="drop")
+        depth = jnp.where(inside, render(n, (x, y)), jnp.inf)
+        return images.at[index, half + row, half + column].min(depth, mode="drop")
 
     return over_tiles(put, images, tiles, rows, each, size)
 
@@ -61,8 +62,8 @@ def crop(images: Float[Array, "B Hp Wp"], index, u, v, side: int) -> Float[Array
 def over_depth(
     score: Callable,
     carry,
-    draw: Callable,
-    drawn: Tiles,
+    render: Callable,
+    covered: Tiles,
     scored: Tiles,
     count: int,
     image: ScoredImage,
@@ -70,16 +71,16 @@ def over_depth(
     size: TileSize,
 ):
     """carry = score(carry, hypothesis, u, v, depth, real) over the tiles to be scored of `count` hypotheses, depth with
-    a border of half a window around; `drawn` are the tiles in which there may be a surface."""
+    a border of half a window around; `covered` are the tiles in which there may be a surface."""
     shape = tuple(side + sum(padding(half, size)) for side in image.depth.shape)
     batch = max(1, min(count, _BATCH_PIXELS // (shape[0] * shape[1])))
-    side, each = size.tile + 2 * half, drawn.u.shape[0] // count
+    side, each = size.tile + 2 * half, covered.u.shape[0] // count
 
     def one_batch(number: Int[Array, ""], carry):
         first = number * batch
         rows = (first * each, jnp.minimum(first + batch, count) * each)
         images = jnp.full((batch, *shape), jnp.inf)
-        images = draw_tiles(draw, images, drawn, rows, each, image, half, size)
+        images = render_tiles(render, images, covered, rows, each, image, half, size)
 
         def look(carry, n, u, v, real):
             return score(carry, n, u, v, crop(images, jnp.minimum(n - first, batch - 1), u, v, side), real)

@@ -21,7 +21,7 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
-from bayes3d_ros.parsing.reconstruction import compile_drawing, draw_scene
+from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.search import Context
 from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, draw_table_errors
@@ -88,7 +88,7 @@ class SceneParser:
         with contextlib.suppress(ParseError):  # a fixed number of objects is not found
             self._sample(frame_key(0, 0), context, grid)
         self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
-        compile_drawing(self._arrays)
+        compile_rendering(self._arrays)
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
@@ -305,7 +305,7 @@ class SceneParser:
         kinds = [int(samples.type[summary.reference, slot]) for slot in summary.slots]
         place, turn = samples.position[summary.reference], samples.orientation[summary.reference]
         poses = [pose_matrix(place[slot], turn[slot]) for slot in summary.slots]
-        return draw_scene(kinds, poses, T_camera_table, frame.intrinsics, self.settings.far, self._arrays)
+        return render_scene(kinds, poses, T_camera_table, frame.intrinsics, self.settings.far, self._arrays)
 
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:

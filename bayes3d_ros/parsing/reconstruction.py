@@ -1,4 +1,4 @@
-"""Depth and labels of a scene at the size of the camera's image, drawn by the model's own renderer.
+"""Depth and labels of a scene at the size of the camera's image, rendered by the model's own renderer.
 
 The rays of the pixels that an object may cover are walked through its voxels so many at a time: compiled once,
 whatever the size of the image.
@@ -23,7 +23,7 @@ _MARGIN = 2  # pixels about what the corners of an object's grid enclose: more t
 _walk = jax.jit(march)
 
 
-def draw_scene(
+def render_scene(
     types: Sequence[int],
     T_camera_object: Sequence[Float[np.ndarray, "4 4"]],
     T_camera_table: Float[np.ndarray, "4 4"],
@@ -38,15 +38,15 @@ def draw_scene(
     labels = np.zeros(depth.shape, np.uint16)
     for label, (type_id, T) in enumerate(zip(types, T_camera_object, strict=True), 1):
         where = _covered(type_id, T, camera, library)
-        drawn = _along(rays[where].reshape(-1, 3), type_id, T, library).reshape(depth[where].shape)
-        nearer = drawn < depth[where]
-        depth[where] = np.where(nearer, drawn, depth[where])
+        rendered = _along(rays[where].reshape(-1, 3), type_id, T, library).reshape(depth[where].shape)
+        nearer = rendered < depth[where]
+        depth[where] = np.where(nearer, rendered, depth[where])
         labels[where] = np.where(nearer, np.uint16(label), labels[where])
     return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), labels
 
 
-def compile_drawing(library: LibraryArrays) -> None:
-    """Compile all that `draw_scene` needs for a library of this shape."""
+def compile_rendering(library: LibraryArrays) -> None:
+    """Compile all that `render_scene` needs for a library of this shape."""
     _along(np.ones((1, 3), np.float32), 0, np.eye(4), library)
 
 

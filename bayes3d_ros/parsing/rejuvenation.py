@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
 from bayes3d_ros.parsing.proposal import Proposal, log_density
@@ -103,7 +103,7 @@ def _move(
 
     def with_other(j: Array, scenes: Array) -> Array:
         other = _slot(state.objects, j)
-        return jax.lax.cond(j == m, lambda: scenes, lambda: draw_objects(other, scenes, *context, window))
+        return jax.lax.cond(j == m, lambda: scenes, lambda: render_objects(other, scenes, *context, window))
 
     bare = jnp.broadcast_to(empty.scene, state.scenes.shape)
     without = jax.lax.fori_loop(0, count, with_other, bare)
@@ -149,7 +149,7 @@ def _move(
     start = with_terms(everyone, mine, state.loglik_grid, state.solo_gain), state.log_weight, jnp.float32(1.0)
     end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, start)
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
-    scenes = draw_objects(end.new, without[end.ancestor], *context, window)
+    scenes = render_objects(end.new, without[end.ancestor], *context, window)
     return WeightedScenes(
         objects, end.solo_gain, state.lineage[end.ancestor], scenes, end.loglik_grid, end.log_likelihood, log_weight
     )

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.noise import NoiseGrid
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
@@ -134,7 +134,7 @@ def step(
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
     lineage = state.lineage[end.ancestor].at[:, count].set(end.lineage)
-    scenes = draw_objects(end.new, state.scenes[end.ancestor], *context, window)
+    scenes = render_objects(end.new, state.scenes[end.ancestor], *context, window)
     proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
     return Population(
         objects=objects,

@@ -11,7 +11,7 @@ from bayes3d_ros.likelihood import scene_score
 from bayes3d_ros.likelihood.cpu import call_frame
 from bayes3d_ros.likelihood.cpu.call_frame import EXPECTED, Layout
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain, pad_scene
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene, render_objects
 from bayes3d_ros.parsing.coarse_search import Evidence, cells_in_turn, score_cells
 
 NOISE, WINDOW = Noise(jnp.array([0.003]), jnp.array([0.05])), 3
@@ -59,7 +59,7 @@ def test_xla_scores_and_renders_where_frames_cannot_be_read(planted, scene, capl
     def results():
         # Functions of their own: of the same ones JAX would take what it traced before.
         gain = jax.jit(lambda *given: log_likelihood_gain.__wrapped__(*given, WINDOW))
-        depth = jax.jit(lambda *given: draw_objects.__wrapped__(*given, WINDOW))
+        depth = jax.jit(lambda *given: render_objects.__wrapped__(*given, WINDOW))
         found = gain(placements, jnp.arange(3), scenes, *common, NOISE), depth(placements, scenes, *common)
         return [np.asarray(a) for a in found]
 

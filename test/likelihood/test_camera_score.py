@@ -94,9 +94,9 @@ def scored_by(kernel):
 @pytest.mark.parametrize("name", WORLDS)
 def test_scores_are_those_of_whole_images(name, kernel, cameras, image, arrays):
     told = np.asarray(scored_by(kernel)(cameras, WORLDS[name], image, arrays, NOISE, WINDOW))
-    drawn = jnp.stack([depth_along(T, WORLDS[name], arrays, rays()) for T in cameras])
+    rendered = jnp.stack([depth_along(T, WORLDS[name], arrays, rays()) for T in cameras])
     nothing = jnp.full((1, HEIGHT, WIDTH), jnp.inf)
-    scenes = pad_scene(jnp.concatenate([drawn, nothing]), WINDOW)
+    scenes = pad_scene(jnp.concatenate([rendered, nothing]), WINDOW)
     expected = np.asarray(whole(scenes, image, NOISE, WINDOW))
     expected = expected[:-1] - expected[-1]
     assert np.ptp(expected[:, 0, 0]) > 100

@@ -11,7 +11,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.cpu import loops
 from bayes3d_ros.likelihood.cpu.gain import compiled_depth, compiled_gain
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 
@@ -26,44 +26,44 @@ def image(returns_everywhere):
 
 
 @pytest.fixture(scope="module")
-def drawn(arrays):
+def hypotheses(arrays):
     """Pairs of objects all over the image, turned any way; more rays than are walked side by side."""
     rng = np.random.default_rng(1)
     R = jaxlie.SO3.sample_uniform(jax.random.key(0), (COUNT, 2)).as_matrix()
     place = np.stack([*rng.uniform(-0.15, 0.15, (2, COUNT, 2)), rng.uniform(0.3, 0.6, (COUNT, 2))], -1)
     T = jnp.tile(jnp.eye(4), (COUNT, 2, 1, 1)).at[..., :3, :3].set(R).at[..., :3, 3].set(place)
     types = jnp.asarray(rng.integers(0, int(arrays.num_types), (COUNT, 2)), jnp.int32)
-    return Drawn(types, T, jnp.zeros((COUNT, 4)))
+    return RenderedHypotheses(types, T, jnp.zeros((COUNT, 4)))
 
 
 @pytest.fixture(scope="module")
-def marched(drawn, image, arrays):
+def marched(hypotheses, image, arrays):
     """Depth of the pairs by the walk of rendering/."""
     shape = (HEIGHT, WIDTH, COUNT)
     rays = tuple(jnp.broadcast_to(a, shape) for a in (image.ray_x[:, None], image.ray_y[:, None, None]))
-    each = [march(arrays, drawn.type[:, k], drawn.T_camera_object[:, k], rays) for k in range(2)]
+    each = [march(arrays, hypotheses.type[:, k], hypotheses.T_camera_object[:, k], rays) for k in range(2)]
     return np.asarray(jnp.minimum(*each)).transpose(2, 0, 1)
 
 
-def test_depth_is_that_of_the_walk(drawn, marched, image, arrays):
-    depth = np.asarray(compiled_depth(drawn, None, image, arrays))
+def test_depth_is_that_of_the_walk(hypotheses, marched, image, arrays):
+    depth = np.asarray(compiled_depth(hypotheses, None, image, arrays))
     assert np.isfinite(marched).sum() > 256 * COUNT
     different = ~np.isclose(depth, marched, atol=1e-5)
     assert different.mean() < 2e-4  # rays along an edge, which rounding decides
 
 
-def test_a_hypothesis_does_not_depend_on_those_before_it(drawn, image, arrays):
+def test_a_hypothesis_does_not_depend_on_those_before_it(hypotheses, image, arrays):
     """Lanes are used again and again, also those beyond the last ray."""
-    many = Drawn(*(jnp.tile(a, (40,) + (1,) * (a.ndim - 1)) for a in drawn[:3]))
+    many = RenderedHypotheses(*(jnp.tile(a, (40,) + (1,) * (a.ndim - 1)) for a in hypotheses[:3]))
     depth = np.asarray(compiled_depth(many, None, image, arrays)).reshape(40, COUNT, HEIGHT, WIDTH)
     assert (depth == depth[0]).all()
 
 
-def test_depth_goes_into_the_images_that_there_are(drawn, marched, image, arrays):
+def test_depth_goes_into_the_images_that_there_are(hypotheses, marched, image, arrays):
     before, after, border = 0.45, np.inf, 2
     start = np.full((COUNT, HEIGHT + 5, WIDTH + 7), before, np.float32)
     start[:, : HEIGHT // 2] = after
-    depth = np.asarray(compiled_depth(drawn, jnp.asarray(start), image, arrays, border))
+    depth = np.asarray(compiled_depth(hypotheses, jnp.asarray(start), image, arrays, border))
     expected = start.copy()
     inside = np.s_[:, border : border + HEIGHT, border : border + WIDTH]
     expected[inside] = np.minimum(expected[inside], marched)
@@ -71,25 +71,23 @@ def test_depth_goes_into_the_images_that_there_are(drawn, marched, image, arrays
 
 
 @pytest.mark.parametrize("window", [1, 3, 5, 7])
-def test_every_window(window, drawn, image, arrays):
-    """Over a scene, which the hypotheses hide in part; what they are compared with is drawn by the kernel itself."""
+def test_every_window(window, hypotheses, image, arrays):
+    """Over a scene, which the hypotheses hide in part; what they are compared with is rendered by the kernel itself."""
     scene = jnp.full((1, HEIGHT, WIDTH), jnp.inf).at[:, :, WIDTH // 2 :].set(0.52)
     scenes = SceneDepths(pad_scene(scene, window), jnp.zeros(COUNT, jnp.int32))
-    gain = np.asarray(compiled_gain(drawn, scenes, image, arrays, NOISE, window))
-    depth = jnp.minimum(compiled_depth(drawn, None, image, arrays), scene)
-    after, before = (
-        log_likelihood_scene(pad_scene(d, window), image, NOISE, window) for d in (depth, jnp.asarray(scene))
-    )
+    gain = np.asarray(compiled_gain(hypotheses, scenes, image, arrays, NOISE, window))
+    depth = jnp.minimum(compiled_depth(hypotheses, None, image, arrays), scene)
+    after, before = (log_likelihood_scene(pad_scene(d, window), image, NOISE, window) for d in (depth, scene))
     assert np.ptp(np.asarray(after)[:, 0, 0]) > 100
     np.testing.assert_allclose(gain, np.asarray(after - before), atol=0.02, rtol=2e-5)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_what_is_nowhere_is_not_drawn(wrong, drawn, image, arrays):
+def test_what_is_nowhere_is_not_rendered(wrong, hypotheses, image, arrays):
     """Nor does it lead the kernel astray: a pose that is not a number says nothing, the others what they said."""
-    broken = drawn._replace(T_camera_object=drawn.T_camera_object.at[3].set(wrong))
+    broken = hypotheses._replace(T_camera_object=hypotheses.T_camera_object.at[3].set(wrong))
     gain = np.asarray(compiled_gain(broken, None, image, arrays, NOISE, 3))
-    right = np.asarray(compiled_gain(drawn, None, image, arrays, NOISE, 3))
+    right = np.asarray(compiled_gain(hypotheses, None, image, arrays, NOISE, 3))
     assert (gain[3] == 0).all() and np.abs(right[3]).max() > 1
     np.testing.assert_array_equal(np.delete(gain, 3, 0), np.delete(right, 3, 0))
 

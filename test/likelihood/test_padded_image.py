@@ -1,4 +1,4 @@
-"""Images in arrays with more rows than the camera has: the rows below say nothing, and nothing is drawn in them."""
+"""Images in arrays with more rows than the camera has: the rows below say nothing, and nothing is rendered in them."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from bayes3d_ros.likelihood.camera_score import World, log_likelihood_of_cameras
 from bayes3d_ros.likelihood.cpu.gain import compiled_gain
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import array_shape, halved, padded_height, scored_image
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.search import evidence_left
@@ -100,15 +100,15 @@ def test_hypotheses_gain_the_same(images, placements, arrays, table, kernel):
         pytest.skip("free points are scored by tiles")
     tight, padded = (gains(kernel, placements, image, arrays, table) for image in (images.tight, images.padded))
     np.testing.assert_allclose(padded, tight, rtol=1e-6, atol=1e-5)
-    if images.padded.likelihood.name == "depth":  # what is drawn below the last row would be in the windows of that row
-        drawn_below = gains(kernel, placements, images.padded._replace(rows=None), arrays, table)
-        assert np.abs(drawn_below - tight).max() > 0.1
+    if images.padded.likelihood.name == "depth":  # what is rendered below the last row would be in that row's windows
+        rendered_below = gains(kernel, placements, images.padded._replace(rows=None), arrays, table)
+        assert np.abs(rendered_below - tight).max() > 0.1
 
 
-def test_scenes_are_drawn_and_scored_the_same(images, placements, arrays, table):
+def test_scenes_are_rendered_and_scored_the_same(images, placements, arrays, table):
     def scenes(image):
         start = jnp.stack([pad_scene(jnp.asarray(image.bare_depth), WINDOW)] * len(placements.x))
-        return draw_objects(placements, start, image, arrays, table, WINDOW)
+        return render_objects(placements, start, image, arrays, table, WINDOW)
 
     tight, padded = scenes(images.tight), scenes(images.padded)
     below = ROWS + WINDOW // 2

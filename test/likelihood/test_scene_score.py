@@ -10,7 +10,7 @@ from bayes3d_ros.likelihood.cpu.gain import compiled_gain
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Likelihood, Noise
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import FreePoints, ScoredImage, halved
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT, WINDOW = 42, 30, 3  # no multiples of the tiles' side
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.4]))
 
 gain_of = jax.jit(log_likelihood_gain, static_argnames="window")
-with_objects = jax.jit(draw_objects, static_argnames="window")
+with_objects = jax.jit(render_objects, static_argnames="window")
 whole = jax.jit(log_likelihood_scene, static_argnames="window")
 
 
@@ -77,7 +77,7 @@ def placements(table):
 
 
 @pytest.fixture(scope="module")
-def drawn(placements, image, arrays, table):
+def rendered(placements, image, arrays, table):
     """Depth of each object alone over the whole image."""
     T = T_camera_object(placements, arrays, table)
     shape = (HEIGHT, WIDTH, len(placements.x))
@@ -86,21 +86,21 @@ def drawn(placements, image, arrays, table):
 
 
 @pytest.fixture(scope="module")
-def ancestors(image, drawn):
+def ancestors(image, rendered):
     """Depth of three scenes: the bare table, with one object, and with two."""
     bare = np.asarray(image.bare_depth)
-    one = np.minimum(bare, drawn[3])
-    return np.stack([bare, one, np.minimum(one, drawn[7])])
+    one = np.minimum(bare, rendered[3])
+    return np.stack([bare, one, np.minimum(one, rendered[7])])
 
 
 @pytest.fixture(scope="module")
-def at_the_rim(drawn):
+def at_the_rim(rendered):
     """Whether an object reaches the image's first or last row or column."""
-    return np.isfinite(drawn[:, [0, -1]]).any((1, 2)) | np.isfinite(drawn[:, :, [0, -1]]).any((1, 2))
+    return np.isfinite(rendered[:, [0, -1]]).any((1, 2)) | np.isfinite(rendered[:, :, [0, -1]]).any((1, 2))
 
 
-def test_objects_are_in_the_image_partly_outside_and_behind(drawn, at_the_rim):
-    covered = np.isfinite(drawn).sum((1, 2))
+def test_objects_are_in_the_image_partly_outside_and_behind(rendered, at_the_rim):
+    covered = np.isfinite(rendered).sum((1, 2))
     assert (covered[~at_the_rim] > 20).sum() >= 12 and (covered[at_the_rim] > 20).sum() >= 8
     assert (covered[44:47] == 0).all()
 
@@ -114,13 +114,13 @@ def gain_by(kernel, *arguments):
 
 
 @pytest.fixture(scope="module", params=[compiled_gain, triton_gain, None])
-def gains(request, placements, drawn, ancestors, image, arrays, table):
+def gains(request, placements, rendered, ancestors, image, arrays, table):
     """Gains of the placements, each over one of the ancestors, by either way; and from whole images."""
-    ancestor = np.arange(len(drawn)) % 3
+    ancestor = np.arange(len(rendered)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
     over = jnp.asarray(ancestor), scenes, image, arrays, table
     gain = np.asarray(gain_by(request.param, placements, *over, NOISE, WINDOW))
-    after = np.minimum(ancestors[ancestor], drawn)
+    after = np.minimum(ancestors[ancestor], rendered)
     after = np.asarray(whole(pad_scene(jnp.asarray(after), WINDOW), image, NOISE, WINDOW))
     before = np.asarray(whole(scenes, image, NOISE, WINDOW))[ancestor]
     expected = after - before
@@ -138,11 +138,11 @@ def test_gain_at_the_rim_of_the_image(gains, at_the_rim):
     np.testing.assert_allclose(gain, expected, atol=0.01, rtol=1e-5)
 
 
-def test_drawing_objects(placements, drawn, ancestors, image, arrays, table):
-    before = ancestors[np.arange(len(drawn)) % 3]
+def test_rendering_objects(placements, rendered, ancestors, image, arrays, table):
+    before = ancestors[np.arange(len(rendered)) % 3]
     scenes = pad_scene(jnp.asarray(before, jnp.float32), WINDOW)
     after = with_objects(placements, scenes, image, arrays, table, WINDOW)
-    expected = pad_scene(jnp.asarray(np.minimum(before, drawn)), WINDOW)
+    expected = pad_scene(jnp.asarray(np.minimum(before, rendered)), WINDOW)
     np.testing.assert_allclose(np.asarray(after), np.asarray(expected), rtol=1e-5)
 
 
@@ -195,11 +195,11 @@ def test_layers_of_free_points_add_up(ancestors, image, cloud):
     assert np.abs(first - np.asarray(whole(scenes, image, NOISE, WINDOW))).min() > 10
 
 
-def test_gain_of_free_points_is_the_difference_of_whole_clouds(placements, drawn, ancestors, cloud, arrays, table):
-    ancestor = np.arange(len(drawn)) % 3
+def test_gain_of_free_points_is_the_difference_of_whole_clouds(placements, rendered, ancestors, cloud, arrays, table):
+    ancestor = np.arange(len(rendered)) % 3
     scenes = pad_scene(jnp.asarray(ancestors, jnp.float32), WINDOW)
     gain = np.asarray(gain_of(placements, jnp.asarray(ancestor), scenes, cloud, arrays, table, NOISE, WINDOW))
-    after = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], drawn)), WINDOW)
+    after = pad_scene(jnp.asarray(np.minimum(ancestors[ancestor], rendered)), WINDOW)
     before = np.asarray(whole(scenes, cloud, NOISE, WINDOW))[ancestor]
     expected = np.asarray(whole(after, cloud, NOISE, WINDOW)) - before
     assert np.ptp(expected[:, 0, 0]) > 100

@@ -10,7 +10,7 @@ from jax.sharding import AbstractDevice, AbstractMesh
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 
 COUNT, SIZE = 5, 20
 NOISE = Noise(jnp.array([0.002, 0.005]), jnp.array([0.05, 0.1, 0.4]))
@@ -25,13 +25,13 @@ def image(returns_everywhere):
 @pytest.mark.parametrize("over_scenes", [False, True])
 def test_it_is_lowered_for_a_gpu(over_scenes, image, arrays):
     T = jnp.tile(jnp.eye(4), (COUNT, 2, 1, 1)).at[:, :, 2, 3].set(0.5)
-    drawn = Drawn(jnp.zeros((COUNT, 2), jnp.int32), T, jnp.zeros((COUNT, 4)))
+    hypotheses = RenderedHypotheses(jnp.zeros((COUNT, 2), jnp.int32), T, jnp.zeros((COUNT, 4)))
     scenes = SceneDepths(jnp.ones((3, SIZE + 12, SIZE + 12)), jnp.zeros(COUNT, jnp.int32)) if over_scenes else None
     gain = jax.jit(triton_gain, static_argnames=("window", "interpret"))
     with jax.sharding.use_abstract_mesh(
         AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", None, "gpu"))
     ):
-        traced = gain.trace(drawn, scenes, image, arrays, NOISE, window=5, interpret=False)
+        traced = gain.trace(hypotheses, scenes, image, arrays, NOISE, window=5, interpret=False)
         lowered = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert "__gpu$xla.gpu.triton" in lowered and "triton_gain" in lowered
     assert f"tensor<{COUNT * 2 * 4}xf32>" in lowered  # three of p_outlier are padded to four

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from bayes3d_ros.likelihood.noise import log_marginal, noise_grid
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_gain
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.library_arrays import NUM_FACES, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
@@ -45,7 +45,7 @@ def gains(context, grid, board, empty):
     """Nats that each prior draw gains beside the board, -inf where solids conflict; and whether the image would show
     it at all."""
     first = jnp.zeros(BLOCK, jnp.int32)
-    alone = draw_objects(board, empty.scenes[:1], *context, WINDOW)
+    alone = render_objects(board, empty.scenes[:1], *context, WINDOW)
     table = empty.loglik_grid[:1] + log_likelihood_gain(
         board, first[:1], empty.scenes[:1], *context, grid.coarse, WINDOW
     )
@@ -55,7 +55,7 @@ def gains(context, grid, board, empty):
     def of_block(placement):
         gain = log_likelihood_gain(placement, first, alone, *context, grid.coarse, WINDOW)
         clash = conflicts(placement, others, jnp.int32(1), context.library, smc.OVERLAP_LIMIT)
-        shown = draw_objects(placement, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
+        shown = render_objects(placement, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
         value = log_marginal(table + gain, grid) - log_marginal(table, grid)
         return jnp.where(clash, -jnp.inf, value), ~clash & (shown == alone).all((1, 2))
 

@@ -14,7 +14,7 @@ from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import load_library
 from bayes3d_ros.parsing.parser import SceneParser
-from bayes3d_ros.parsing.reconstruction import draw_scene
+from bayes3d_ros.parsing.reconstruction import render_scene
 from bayes3d_ros.posterior.types import FEWEST_USABLE
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import ParserSettings
@@ -143,8 +143,8 @@ def test_a_scene_is_drawn_as_by_a_walk_of_all_rays(library, size, T):
     """To the last bit."""
     camera = Intrinsics(0.8 * size[0], 0.8 * size[0], size[0] / 2, size[1] / 2, *size)
     arrays, table, rays = library_arrays(library), placed(0.0, 0.3, 1.0), camera.rays()
-    depth, labels = draw_scene([1], [T], table, camera, 5.0, arrays)
-    bare, nothing = draw_scene([], [], table, camera, 5.0, arrays)
+    depth, labels = render_scene([1], [T], table, camera, 5.0, arrays)
+    bare, nothing = render_scene([], [], table, camera, 5.0, arrays)
     pair = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
     drawn = np.asarray(jax.jit(march)(arrays, np.int32(1), T.astype(np.float32), pair))
     expected = np.fmin(bare, np.where(np.isfinite(drawn), drawn, np.nan))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.cpu import loops
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
@@ -18,14 +18,20 @@ _NEGLIGIBLE = 14.0  # nats below the outliers' density: one in a million
 
 @partial(jax.jit, static_argnames="window")
 def compiled_gain(
-    drawn: Drawn, scenes: SceneDepths | None, image: ScoredImage, library: LibraryArrays, noise: Noise, window: int
+    hypotheses: RenderedHypotheses,
+    scenes: SceneDepths | None,
+    image: ScoredImage,
+    library: LibraryArrays,
+    noise: Noise,
+    window: int,
 ) -> Float[Array, "N S P"]:
-    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
     without scenes, nothing is there before."""
-    shape = (len(drawn.type), len(noise.sigma), len(noise.p_outlier))
+    scene_shape = (0, 0) if scenes is None else scenes.depth.shape[1:]
+    shape = (len(hypotheses.type), len(noise.sigma), len(noise.p_outlier))
     numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight)
     inputs = (
-        *_things(drawn, library),
+        *_things(hypotheses, library),
         _real(image.depth),
         _whole(image.pixel_class),
         _real(image.ray_x),
@@ -35,41 +41,45 @@ def compiled_gain(
         jnp.zeros(0, jnp.int32) if scenes is None else _whole(scenes.ancestor),
         _real(noise.sigma),
         _real(noise.p_outlier),
-        _whole([window, drawn.everywhere, *((0, 0) if scenes is None else scenes.depth.shape[1:]), image.own_rows]),
+        _whole([window, hypotheses.everywhere, *scene_shape, image.own_rows]),
     )
     return _call(loops.GAIN, shape, inputs)
 
 
 @partial(jax.jit, static_argnames="border")
 def compiled_depth(
-    drawn: Drawn, start: Float[Array, "N Hp Wp"] | None, image: ScoredImage, library: LibraryArrays, border: int = 0
+    hypotheses: RenderedHypotheses,
+    start: Float[Array, "N Hp Wp"] | None,
+    image: ScoredImage,
+    library: LibraryArrays,
+    border: int = 0,
 ) -> Float[Array, "N Hp Wp"]:
-    """Depth of what is drawn where it is nearer than what there is to start with, inf where nothing is. Images to start
-    with have so many pixels before the camera's first row and column, and any number after the last."""
-    shape = (len(drawn.type), *image.depth.shape) if start is None else start.shape
+    """Depth of what is rendered where it is nearer than what there is to start with, inf where nothing is. Images to
+    start with have so many pixels before the camera's first row and column, and any number after the last."""
+    shape = (len(hypotheses.type), *image.depth.shape) if start is None else start.shape
     inputs = (
-        *_things(drawn, library),
+        *_things(hypotheses, library),
         _real(image.ray_x),
         _real(image.ray_y),
         _real([*image.focal, *image.centre]),
         jnp.zeros(0) if start is None else _real(start),
-        _whole([*shape[1:], border, drawn.everywhere, image.own_rows]),
+        _whole([*shape[1:], border, hypotheses.everywhere, image.own_rows]),
     )
     return _call(loops.DEPTH, shape, inputs)
 
 
-def _things(drawn: Drawn, library: LibraryArrays) -> tuple[Array, ...]:
+def _things(hypotheses: RenderedHypotheses, library: LibraryArrays) -> tuple[Array, ...]:
     return (
         _whole(library.words),
         _whole(library.first),
         _whole(library.dims),
         _real(library.origin),
         _real(library.voxel_size),
-        _whole(drawn.type),
+        _whole(hypotheses.type),
         _real(library.hull_corner),
         _whole(library.hull_count),
-        _real(drawn.T_camera_object[..., :3, :]),
-        _real(drawn.plane),
+        _real(hypotheses.T_camera_object[..., :3, :]),
+        _real(hypotheses.plane),
     )
 
 

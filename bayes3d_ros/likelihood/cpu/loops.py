@@ -1,4 +1,4 @@
-"""Hypotheses drawn and scored one after the other by loops that numba compiles, for CPUs.
+"""Hypotheses rendered and scored one after the other by loops that numba compiles, for CPUs.
 
 Rays of a hypothesis walk side by side (`Lanes`): every loop over lanes is plain arithmetic, of which LLVM makes vector
 instructions, and what they look up is fetched in a loop of its own. Rays that have ended make room. The walk is that
@@ -573,7 +573,7 @@ def _eye(pose, origin, axis):
 
 
 @inlined
-def _draw_object(things, thing, k, picture, patch, stride, shift, space):
+def _render_object(things, thing, k, picture, patch, stride, shift, space):
     """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
     type_id, pose, turn, lanes = (
         things.type_id[thing],
@@ -628,7 +628,7 @@ def _draw_object(things, thing, k, picture, patch, stride, shift, space):
 
 
 @fast
-def _draw_plane(normal, offset, ray_x, y, patch, at):
+def _render_plane(normal, offset, ray_x, y, patch, at):
     """A row of the plane's depth (`likelihood/plane.py`)."""
     at = u64(at)
     for k in range(u64(len(ray_x))):
@@ -918,16 +918,16 @@ def _outlines(things, n, objects, picture, space):
 
 
 @inlined
-def _draw_objects(things, n, objects, picture, patch, stride, shift, space):
+def _render_objects(things, n, objects, picture, patch, stride, shift, space):
     """The objects whose outlines have been found, into a patch that holds them."""
     for k in range(objects):
-        _draw_object(things, n * objects + k, k, picture, patch, stride, shift, space)
+        _render_object(things, n * objects + k, k, picture, patch, stride, shift, space)
 
 
 @strict
-def _draw_planes(plane, picture, patch, stride, shift):
+def _render_planes(plane, picture, patch, stride, shift):
     for v in range(len(picture.ray_y)):
-        _draw_plane(plane, plane[3], picture.ray_x, picture.ray_y[v], patch, v * stride + shift)
+        _render_plane(plane, plane[3], picture.ray_x, picture.ray_y[v], patch, v * stride + shift)
 
 
 @strict
@@ -980,8 +980,8 @@ def _gains(
         stride, size, left, top = _begin(picture, scenes, scene_at, scene_shape[1], rectangle, border, space)
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
-            _draw_planes(plane, picture, space.patch, stride, shift)
-        _draw_objects(things, n, objects, picture, space.patch, stride, shift, space)
+            _render_planes(plane, picture, space.patch, stride, shift)
+        _render_objects(things, n, objects, picture, space.patch, stride, shift, space)
         low, high = _mark(space.patch, space.before, size, space.changed)
         _windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -1023,9 +1023,9 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
             image[k] = min(start[n * pixels + k], f32(_NOTHING)) if len(start) > 0 else f32(_NOTHING)
         plane = planes[4 * n : 4 * n + 4]
         if everywhere and _is_plane(plane):
-            _draw_planes(plane, picture, image, columns, shift)
+            _render_planes(plane, picture, image, columns, shift)
         _outlines(things, n, objects, picture, space)
-        _draw_objects(things, n, objects, picture, image, columns, shift, space)
+        _render_objects(things, n, objects, picture, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < _NOTHING else f32(np.inf)
 

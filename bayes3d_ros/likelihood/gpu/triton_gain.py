@@ -1,4 +1,4 @@
-"""Hypotheses drawn and scored in one kernel (Pallas, Triton), for GPUs.
+"""Hypotheses rendered and scored in one kernel (Pallas, Triton), for GPUs.
 
 A program takes one hypothesis after the other. It walks the rays of the pixels that the hypothesis can change, puts
 their depth where the windows of its own threads find it again (a patch of a few kilobytes, which stays in the cache),
@@ -16,7 +16,7 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_pixel_class, outlier_density, ray_mixture
-from bayes3d_ros.likelihood.hypotheses import Drawn, SceneDepths
+from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import (
     MOST_STEPS,
     NEAR,
@@ -82,7 +82,7 @@ class _Shape(NamedTuple):
 
 @partial(jax.jit, static_argnames=("window", "interpret"))
 def triton_gain(
-    drawn: Drawn,
+    hypotheses: RenderedHypotheses,
     scenes: SceneDepths | None,
     image: ScoredImage,
     library: LibraryArrays,
@@ -90,11 +90,11 @@ def triton_gain(
     window: int,
     interpret: bool | None = None,
 ) -> Float[Array, "N S P"]:
-    """log p(image | scene and what is drawn) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
+    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
     without scenes, nothing is there before. Where there is no GPU it is interpreted, slowly, unless `interpret` says
     otherwise."""
     interpret = jax.default_backend() != "gpu" if interpret is None else interpret
-    count, objects = drawn.type.shape
+    count, objects = hypotheses.type.shape
     height, width = image.depth.shape
     columns = pl.next_power_of_2(len(noise.p_outlier))
     # Odds that are not asked for: the last again.
@@ -118,10 +118,10 @@ def triton_gain(
         dims=library.dims.astype(jnp.float32).ravel(),
         origin=library.origin.ravel(),
         size=library.voxel_size,
-        type=drawn.type.ravel(),
-        pose=drawn.T_camera_object[..., :3, :].ravel(),
-        plane=drawn.plane.ravel(),
-        rectangle=_rectangles(drawn, image, library, window // 2).ravel(),
+        type=hypotheses.type.ravel(),
+        pose=hypotheses.T_camera_object[..., :3, :].ravel(),
+        plane=hypotheses.plane.ravel(),
+        rectangle=_rectangles(hypotheses, image, library, window // 2).ravel(),
         depth=image.depth.ravel(),
         pixel_class=image.pixel_class.ravel(),
         ray_x=image.ray_x,
@@ -146,10 +146,14 @@ def triton_gain(
     return gain.reshape(count, shape.sigmas, columns)[:, :, : len(noise.p_outlier)]
 
 
-def _rectangles(drawn: Drawn, image: ScoredImage, library: LibraryArrays, half: int) -> Int[Array, "N 4"]:
+def _rectangles(
+    hypotheses: RenderedHypotheses, image: ScoredImage, library: LibraryArrays, half: int
+) -> Int[Array, "N 4"]:
     """First and one past the last column and row of the pixels whose windows a hypothesis may meet."""
     (height, width), own_rows = image.depth.shape, image.own_rows
-    tiles = tiles_of_objects(drawn.T_camera_object, drawn.type, image, library, half, drawn.everywhere, LARGE.tile)
+    tiles = tiles_of_objects(
+        hypotheses.T_camera_object, hypotheses.type, image, library, half, hypotheses.everywhere, LARGE.tile
+    )
     rows = -(-height // LARGE.tile)
     long, left, top = (a.reshape(-1, rows) for a in (jnp.diff(tiles.first), tiles.u, tiles.v))
     some = long > 0
@@ -168,9 +172,9 @@ def _kernel(*refs: Any, shape: _Shape) -> None:
         n = program + turn * shape.programs
 
         @pl.when(n < shape.hypotheses)
-        def draw_and_score() -> None:
+        def render_and_score() -> None:
             u0, v0, u1, v1 = (given.rectangle[4 * n + k] for k in range(4))
-            _draw(given, shape, n, (u0, v0, u1, v1), patches, patch)
+            _render(given, shape, n, (u0, v0, u1, v1), patches, patch)
             if shape.compiled:  # interpreted, there is one thread
                 triton.debug_barrier()
             _score(given, shape, n, (u0, v0, u1, v1), patches, patch, gain)
@@ -191,7 +195,7 @@ def _blocks(area: Array, across: Array) -> tuple[Array, Any]:
     return (area + _BLOCK - 1) // _BLOCK, block
 
 
-def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
+def _render(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
     """Depth of a hypothesis in its rectangle, and half a window around."""
     half = shape.window // 2
     u0, v0, u1, v1 = rectangle
@@ -206,7 +210,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
     def look_up(index: Array, cell: list[Array]) -> tuple[Array, list[Array]]:
         return triton.load(given.words.at[index]), cell
 
-    def draw(k: Array, _: None) -> None:
+    def render(k: Array, _: None) -> None:
         index, row, column, real = block(k)
         u, v = u0 - half + column, v0 - half + row
         inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < own_rows)
@@ -238,7 +242,7 @@ def _draw(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: An
             depth = jnp.minimum(depth, depth_met(t))
         triton.store(patches.at[patch + index], jnp.where(inside, depth, NO_SURFACE), mask=real)
 
-    jax.lax.fori_loop(0, count, draw, None)
+    jax.lax.fori_loop(0, count, render, None)
 
 
 def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array, gain: Any) -> None:
@@ -272,13 +276,13 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
             front_margin=front_margin,
         )
 
-        def drawn(dv: int, du: int) -> Array:
+        def rendered(dv: int, du: int) -> Array:
             place = (row + half + dv) * (wide + 2 * half) + column + half + du
             return triton.load(patches.at[patch + place], mask=real, other=NO_SURFACE)
 
         if not shape.scene:
             alone = jnp.where(pixels.pixel_class == NO_RETURN, 0.0, jnp.log(outlier_density(pixels)))[:, None]
-            value = log_of(pixels, drawn, sigma)
+            value = log_of(pixels, rendered, sigma)
         else:
             scene_height, scene_width = shape.scene
             first = given.ancestor[n] * scene_height * scene_width
@@ -288,7 +292,7 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
                 return triton.load(given.scenes.at[place])
 
             alone = log_of(pixels, before, sigma)
-            value = log_of(pixels, lambda dv, du: jnp.minimum(before(dv, du), drawn(dv, du)), sigma)
+            value = log_of(pixels, lambda dv, du: jnp.minimum(before(dv, du), rendered(dv, du)), sigma)
         return total + jnp.sum(jnp.where(real[:, None], value - alone, 0.0), 0)
 
     def one_sigma(s: Array, _: None) -> None:

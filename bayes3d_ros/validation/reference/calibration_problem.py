@@ -16,7 +16,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Likelihood
 from bayes3d_ros.likelihood.noise import NoiseGrid
-from bayes3d_ros.likelihood.scene_score import draw_objects, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
@@ -123,7 +123,7 @@ def _render(
     scenes = pad_scene(blank.bare_depth, window)[None]
     for m in range(objects.type.shape[0]):
         one = jax.tree.map(lambda a, m=m: a[m][None], objects)
-        drawn = draw_objects(one, scenes, blank, library, table, window)
+        drawn = render_objects(one, scenes, blank, library, table, window)
         scenes = jnp.where(m < number, drawn, scenes)
     return scenes[0]
 
