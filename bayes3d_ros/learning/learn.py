@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
 from bayes3d_ros.learning.segment import Surface, Thing, View, ViewError, middle, segment, surface
@@ -109,10 +110,7 @@ def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) ->
     if len(there) <= most:
         return there
     places = np.array([pose[:3, 3] for pose in poses if pose is not None])
-    chosen = [0]
-    while len(chosen) < most:
-        apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)
-        chosen.append(int(apart.argmax()))
+    chosen = farthest_first(0, most, lambda k: np.linalg.norm(places - places[k], axis=1))
     return sorted(there[k] for k in chosen)
 
 

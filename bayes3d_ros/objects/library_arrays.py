@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.objects.empty_boxes import empty_boxes
 from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
@@ -159,10 +160,5 @@ def _spread(points: Float[np.ndarray, "S 3"], count: int) -> Int[np.ndarray, "co
         return np.arange(count) % len(points)
     pool = np.linspace(0, len(points) - 1, min(len(points), 20 * count)).astype(int)
     points = points[pool]
-    chosen = np.empty(count, int)
-    chosen[0] = np.argmin(((points - points.mean(0)) ** 2).sum(1))
-    distance = np.full(len(points), np.inf)
-    for i in range(1, count):
-        distance = np.minimum(distance, ((points - points[chosen[i - 1]]) ** 2).sum(1))
-        chosen[i] = distance.argmax()
-    return pool[chosen]
+    first = int(np.argmin(((points - points.mean(0)) ** 2).sum(1)))
+    return pool[farthest_first(first, count, lambda k: ((points - points[k]) ** 2).sum(1))]

@@ -12,6 +12,7 @@ from bayes3d_ros.objects.placement import Placement, Table, log_prior, shifted
 from bayes3d_ros.objects.self_symmetry import ALIKE
 from bayes3d_ros.parsing.proposal import Modes, draw_modes, log_density_modes, refit
 from bayes3d_ros.sampling.resampling import effective_fraction
+from bayes3d_ros.sampling.tempering import tempered
 
 Tree = TypeVar("Tree")
 _DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
@@ -64,23 +65,6 @@ def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     return scale / jnp.maximum(excess, 1)[:, None, None]
 
 
-def _temper(log_value: Float[Array, "M D"], effective: float) -> Float[Array, "M D"]:
-    """Weights exp(beta v), normalised along the last axis, with beta <= 1 as large as keeps `effective` samples."""
-
-    def weights(beta: Float[Array, "M"]) -> Float[Array, "M D"]:
-        return jax.nn.softmax(beta[:, None] * log_value, -1)
-
-    def halve(bounds, _):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        enough = 1 / (weights(jnp.exp(middle)) ** 2).sum(-1) >= effective
-        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
-
-    start = (jnp.full(log_value.shape[0], -16.0), jnp.zeros(log_value.shape[0]))
-    (low, _), _ = jax.lax.scan(halve, start, None, length=14)
-    return weights(jnp.exp(low))
-
-
 def _draw_about(placement: Placement, offset: Float[Array, "M D 3"]) -> Placement:
     """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
     count = offset.shape[1]
@@ -108,7 +92,7 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
         value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
         value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
-        weight = _temper(value, 5.0)
+        weight = tempered(value, 5.0)
         centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
@@ -134,7 +118,7 @@ def sharpen(
         value = jnp.maximum(value, -1e9)
         best = jnp.argmax(value, 1)
         height = value - value.max(1, keepdims=True)
-        weight = _temper(height, 0.6 * draws)
+        weight = tempered(height, 0.6 * draws)
         i, j = jnp.triu_indices(3)
         square = step[..., i] * step[..., j] * jnp.where(i == j, 0.5, 1.0)
         features = jnp.concatenate([jnp.ones_like(step[..., :1]), step, square], -1)
@@ -173,7 +157,7 @@ def adapt(
         log_drawn = jax.nn.logsumexp(log_density_modes(draws, wide), 1)
         log_weight = log_target - log_drawn
         log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
-        weight = _temper(log_weight[None], _PILOT_ESS * PILOT_DRAWS)[0]
+        weight = tempered(log_weight[None], _PILOT_ESS * PILOT_DRAWS)[0]
         # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
         component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)
         mass = jax.nn.logsumexp(component + log_weight[:, None], 0)

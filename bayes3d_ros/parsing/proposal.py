@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.coarse_search import CELL
+from bayes3d_ros.sampling import student_t
 
 _DEGREES_OF_FREEDOM = 4.0
 # Shares of the proposal: the modes, where something could hide, anywhere. Without modes worth trying, all is floor.
@@ -43,8 +44,8 @@ def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Placement:
     keys = jax.random.split(key, 3)
     m = jax.random.categorical(keys[0], modes.log_weight, shape=(count,))
     gauss = jax.random.normal(keys[1], (count, 3))
-    stretch = jnp.sqrt(_DEGREES_OF_FREEDOM / jax.random.chisquare(keys[2], _DEGREES_OF_FREEDOM, shape=(count,)))
-    offset = jnp.einsum("nab,nb->na", modes.scale[m], gauss) * stretch[:, None]
+    stretch = student_t.stretch(keys[2], count, _DEGREES_OF_FREEDOM)
+    offset = jnp.einsum("nab,nb->na", modes.scale[m], gauss) * stretch
     centre = modes.centre
     return Placement(
         type=centre.type[m],
@@ -74,18 +75,12 @@ def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryA
 
 def log_density_modes(placement: Placement, modes: Modes) -> Float[Array, "N M"]:
     """log of weight times density of every component, per metre^2 and radian; -inf for another type or face."""
-    nu = _DEGREES_OF_FREEDOM
     same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
     L = modes.scale
-    log_norm = (
-        jax.scipy.special.gammaln((nu + 3) / 2)
-        - jax.scipy.special.gammaln(nu / 2)
-        - 1.5 * jnp.log(nu * jnp.pi)
-        - jnp.log(jnp.abs(L[:, 0, 0] * L[:, 1, 1] * L[:, 2, 2]))
-    )
+    log_determinant = jnp.log(jnp.abs(L[:, 0, 0] * L[:, 1, 1] * L[:, 2, 2]))
     # A wide component reaches around the circle.
     terms = [
-        log_norm - (nu + 3) / 2 * jnp.log1p((whitened(placement, modes, turn) ** 2).sum(-1) / nu)
+        student_t.log_density((whitened(placement, modes, turn) ** 2).sum(-1), 3, _DEGREES_OF_FREEDOM, log_determinant)
         for turn in (-2 * jnp.pi, 0.0, 2 * jnp.pi)
     ]
     return jnp.where(same, jax.nn.logsumexp(jnp.stack(terms), 0) + modes.log_weight, -jnp.inf)

@@ -18,10 +18,10 @@ from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
+from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.proposal import Proposal, log_density
 from bayes3d_ros.parsing.search import Context, conflicts
-from bayes3d_ros.parsing.tempering import Proposed, move_new
-from bayes3d_ros.sampling.resampling import normalised, resample
+from bayes3d_ros.sampling.resampling import distinct_fraction, normalised, resample
 
 _COOLING = 0.7  # ratio of neighbouring exponents: about three quarters of the particles stay effective
 _MOVES = 3  # at b = 1, when all is done: one of each kind
@@ -56,22 +56,13 @@ class Effort(NamedTuple):
     heats: Int[Array, ""]  # steps down to the least exponent, 0.7^heats
 
 
-def distinct_fraction(placement: Placement, log_weight: Float[Array, "N"]) -> Float[Array, ""]:
-    """Effective fraction of the particles, copies of a placement counted as one."""
-    order = jnp.argsort(placement.x)
-    x, weight = placement.x[order], jax.nn.softmax(log_weight)[order]
-    group = jnp.cumsum(jnp.concatenate([jnp.zeros(1, jnp.int32), (x[1:] != x[:-1]).astype(jnp.int32)]))
-    mass = jnp.zeros(len(x)).at[group].add(weight)
-    return 1 / ((mass**2).sum() * len(x))
-
-
 def rejuvenate(
     key: PRNGKeyArray, state: WeightedScenes, proposals: Proposal, count: Int[Array, ""], frame: Frame, effort: Effort
 ) -> WeightedScenes:
     """Move as many objects as there are turns: first that of which the fewest placements are left, then the others;
     proposals [M], of each slot's stage."""
     slots = state.objects.type.shape[1]
-    left = jnp.stack([distinct_fraction(_slot(state.objects, m), state.log_weight) for m in range(slots)])
+    left = jnp.stack([distinct_fraction(_slot(state.objects, m).x, state.log_weight) for m in range(slots)])
     first = jnp.argmin(jnp.where(jnp.arange(slots) < count, left, jnp.inf))
 
     def turn(number: Array, state: WeightedScenes) -> WeightedScenes:

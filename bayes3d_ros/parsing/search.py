@@ -39,7 +39,7 @@ from bayes3d_ros.parsing.mode_search import (
     with_lookalikes,
 )
 from bayes3d_ros.parsing.proposal import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, log_density, wrap
-from bayes3d_ros.parsing.tempering import LEVELS, exponents
+from bayes3d_ros.sampling.tempering import exponents
 
 _GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
 _MODES = 8
@@ -50,6 +50,8 @@ _BEHIND = 1e6  # nats
 _REPEATED = 4.0  # nats
 _WIDE = 120  # pixels across: the search sees smaller images whole, wider ones at half their resolution
 _BLUR = 0.002  # metres: candidates are scored at this sigma at least, or those a pixel beside the peak score as misses
+PLANNED_LEVELS = 6  # exponents of the path from the proposal to the target
+STEP_KEEPS = 0.33  # share of the effective draws that a step of the exponent keeps
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
@@ -237,5 +239,6 @@ def find_proposal(
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
     proposal = Proposal(mixture, cells / cells.sum(), shares)
     log_q = log_density(pilots.placement, proposal, library, table)
-    path = exponents(pilots.log_target - log_q, log_q - pilots.log_drawn)
-    return proposal, jnp.where(worth, path, jnp.ones(LEVELS))
+    log_ratio = pilots.log_target - log_q
+    path = exponents(log_ratio, log_q - pilots.log_drawn, PLANNED_LEVELS, STEP_KEEPS)
+    return proposal, jnp.where(worth, path, jnp.ones(PLANNED_LEVELS))

@@ -4,6 +4,14 @@ Stage k carries weighted scenes of k objects towards p_k, the posterior given k 
 integrated out of every target (`noise.py`), so none is replaced between stages and W_i needs no kernel for them. Scenes
 are sets: a set of k objects has k! orders, the sampler makes one of them, and the backward kernel says which object
 came last: the one that explains least alone, since the search adds what explains most first.
+
+An object is not weighted at once but along a path from the proposal to the target by steps, resampled and moved between
+them (Del Moral et al. 2006). The likelihood of an object's pose is sharp and uneven; a mixture that fits it well leaves
+weights that differ by a few nats, one that misses something by tens. The path is q^(1-b) target^b, b from 0 to 1, with
+Metropolis-Hastings moves at every b. The exponents come from pilot draws that are thrown away: they depend on the image
+and the ancestor only, and the evidence stays unbiased. Where particles meet a peak that the pilots did not, a step is
+shortened by the particles' own weights: consistent, with a bias that falls as one over their number (Beskos et al.
+2016), where an unbiased estimate would rest on a single particle.
 """
 
 from functools import partial
@@ -19,14 +27,17 @@ from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objec
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
+from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.proposal import SHARES, Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
-from bayes3d_ros.parsing.search import Context, LeadScene, conflicts, find_proposal
-from bayes3d_ros.parsing.tempering import MOST_LEVELS, TOO_UNEVEN, Proposed, longest_step, move_new
+from bayes3d_ros.parsing.search import STEP_KEEPS, Context, LeadScene, conflicts, find_proposal
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
+from bayes3d_ros.sampling.tempering import longest_step
 
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
+MOST_LEVELS = 16
+TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
 _MOVES = 2  # once resampled at the target; on the way there one
 
 
@@ -177,7 +188,7 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
         level, b, extended, log_weight, log_evidence, ess = state
         c = jnp.where(level < MOST_LEVELS - 1, exponents[jnp.argmax(exponents > b)], 1.0)
         planned = effective_fraction(log_weight + (c - b) * extended.log_ratio)
-        shorter = longest_step(b, c, extended.log_ratio, log_weight)
+        shorter = longest_step(b, c, extended.log_ratio, log_weight, STEP_KEEPS)
         c = jnp.where((planned < TOO_UNEVEN) & (level < MOST_LEVELS - 1), shorter, c)
         log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
         now = effective_fraction(log_weight)

@@ -23,6 +23,15 @@ def effective_fraction(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     return jnp.where(jnp.isfinite(total), ess / log_weight.shape[0], 0.0)
 
 
+def distinct_fraction(value: Float[Array, "N"], log_weight: Float[Array, "N"]) -> Float[Array, ""]:
+    """Effective fraction of the particles, those of equal value (copies of one another) counted as one."""
+    order = jnp.argsort(value)
+    sorted_value, weight = value[order], jax.nn.softmax(log_weight)[order]
+    new = (sorted_value[1:] != sorted_value[:-1]).astype(jnp.int32)
+    mass = jnp.zeros(len(value)).at[jnp.cumsum(jnp.concatenate([jnp.zeros(1, jnp.int32), new]))].add(weight)
+    return 1 / ((mass**2).sum() * len(value))
+
+
 def resample(
     key: PRNGKeyArray, tree: Tree, log_weight: Float[Array, "N"], threshold: float
 ) -> tuple[Tree, Float[Array, "N"]]:

@@ -29,7 +29,9 @@ from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.noise import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import ScoredImage, at_most
 from bayes3d_ros.likelihood.sharding import over_devices
+from bayes3d_ros.sampling import student_t
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, systematic
+from bayes3d_ros.sampling.tempering import tempered
 from bayes3d_ros.tracking.depth_alignment import RENDERED, TrackedScene, aligned, information, rendered_slopes
 
 _FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
@@ -96,19 +98,6 @@ def expected_pose(state: FilterState) -> Float[Array, "4 4"]:
     return product(state.motion[best], state.T_camera_world[best])
 
 
-def _log_t(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """log density of a standard t in six dimensions, given the squared distance from its centre."""
-    nu = _FREEDOM
-    log_norm = jax.scipy.special.gammaln((nu + 6) / 2) - jax.scipy.special.gammaln(nu / 2) - 3 * jnp.log(nu * jnp.pi)
-    return log_norm - (nu + 6) / 2 * jnp.log1p(square / nu)
-
-
-def _draw_t(key: PRNGKeyArray, count: int) -> Float[Array, "N 6"]:
-    gauss_key, chi_key = jax.random.split(key)
-    stretch = jnp.sqrt(_FREEDOM / jax.random.chisquare(chi_key, _FREEDOM, shape=(count, 1)))
-    return jax.random.normal(gauss_key, (count, 6)) * stretch
-
-
 def _scales(motion: Motion) -> Float[Array, "6"]:
     return jnp.concatenate([jnp.full(3, motion.shift), jnp.full(3, motion.turn)])
 
@@ -119,7 +108,9 @@ def log_predictive(
     """log of w_j p(T | particle j), where each particle's velocity leads to `expected`."""
     change = log_about(product(T[:, None], inverse(expected)), jnp.zeros(3))
     scale = _scales(motion)
-    log_p = _log_t(((change / scale) ** 2).sum(-1)) - jnp.log(scale).sum() - log_volume(change)
+    log_p = (
+        student_t.log_density(((change / scale) ** 2).sum(-1), 6, _FREEDOM) - jnp.log(scale).sum() - log_volume(change)
+    )
     return log_p + log_weight
 
 
@@ -142,24 +133,14 @@ class _Chart(NamedTuple):
         # Solved for six columns and not for one a draw: JAX's triangular solve is slow on CPUs.
         inverse_scale = jax.scipy.linalg.solve_triangular(self.scale, jnp.eye(6), lower=True)
         z = jnp.einsum("da,ba->db", tangent - self.mean, inverse_scale, precision=jax.lax.Precision.HIGHEST)
-        return _log_t((z**2).sum(-1)) - jnp.log(jnp.diag(self.scale)).sum() - log_volume(tangent)
+        log_standard = student_t.log_density((z**2).sum(-1), 6, _FREEDOM)
+        return log_standard - jnp.log(jnp.diag(self.scale)).sum() - log_volume(tangent)
 
 
 def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D"]) -> _Chart:
     """The t distribution moved to where draws [D] have high log likelihoods, tempered so that enough of them count."""
     value = jnp.maximum(value - value.max(), -1e6)
-
-    def weights(beta: Array) -> Array:
-        return jax.nn.softmax(beta * value)
-
-    def halve(bounds, _):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        enough = 1 / (weights(jnp.exp(middle)) ** 2).sum() >= _KEEP * len(value)
-        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
-
-    (low, _), _ = jax.lax.scan(halve, (jnp.float32(-16.0), jnp.float32(0.0)), None, length=14)
-    weight = weights(jnp.exp(low))
+    weight = tempered(value, _KEEP * len(value))
     mean = weight @ tangent
     unit = jnp.array(_SMALLEST)
     centred = (tangent - mean) / unit
@@ -260,7 +241,11 @@ def _search(
     chart = _Chart(best, scene.pivot_seen(best), jnp.zeros(6), jnp.diag(scale))
     draw_key, pick_key = jax.random.split(jax.random.fold_in(key, 0))
     index = jax.random.randint(pick_key, (each,), 0, len(expected))
-    tried = product(exp_about(_draw_t(draw_key, each) * scale, jnp.zeros(3)), expected[index]).at[0].set(best)
+    tried = (
+        product(exp_about(student_t.draw_standard(draw_key, each, 6, _FREEDOM) * scale, jnp.zeros(3)), expected[index])
+        .at[0]
+        .set(best)
+    )
     _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
     coarse = at_most(image, _ALIGNED)
     align = over_devices(_all_aligned, devices)
@@ -268,7 +253,7 @@ def _search(
     pick = jnp.argmax(score(chart.pose(means), blurs[1])[:, 0, 0])
     chart = chart._replace(mean=means[pick], scale=scales[pick])
     for number, noise in enumerate(blurs[1:], 1):
-        step = _WIDEN * _draw_t(jax.random.fold_in(key, number), each) @ chart.scale.T
+        step = _WIDEN * student_t.draw_standard(jax.random.fold_in(key, number), each, 6, _FREEDOM) @ chart.scale.T
         tangent = (chart.mean + step).at[0].set(chart.mean)
         chart = _learned(chart, tangent, score(chart.pose(tangent), noise)[:, 0, 0])
     return chart
@@ -313,9 +298,11 @@ def _propose(
 ) -> Float[Array, "D 4 4"]:
     """Draws from the mixture of what the search learned and the predictive of equally likely ancestors."""
     keys = jax.random.split(key, 4)
-    searched = chart.pose(chart.mean + _draw_t(keys[0], count) @ chart.scale.T)
+    searched = chart.pose(chart.mean + student_t.draw_standard(keys[0], count, 6, _FREEDOM) @ chart.scale.T)
     index: Int[Array, "D"] = jax.random.randint(keys[1], (count,), 0, len(expected))
-    predicted = product(exp_about(_draw_t(keys[2], count) * _scales(motion), jnp.zeros(3)), expected[index])
+    predicted = product(
+        exp_about(student_t.draw_standard(keys[2], count, 6, _FREEDOM) * _scales(motion), jnp.zeros(3)), expected[index]
+    )
     from_motion = jax.random.uniform(keys[3], (count,)) < _FROM_MOTION
     return jnp.where(from_motion[:, None, None], predicted, searched)
 

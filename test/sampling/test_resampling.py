@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayes3d_ros.sampling.resampling import effective_fraction, systematic
+from bayes3d_ros.sampling.resampling import distinct_fraction, effective_fraction, systematic
 
 resample = jax.jit(jax.vmap(systematic, in_axes=(0, None, None)), static_argnums=2)
 
@@ -67,3 +67,8 @@ def test_effective_fraction(shift):
 
 def test_effective_fraction_of_nothing_is_zero():
     assert effective_fraction(jnp.full(5, -jnp.inf)) == 0
+
+
+def test_copies_count_as_one():
+    value, log_weight = jnp.array([1.0, 2.0, 1.0, 3.0]), jnp.log(jnp.array([0.25, 0.25, 0.25, 0.25]))
+    assert distinct_fraction(value, log_weight) == pytest.approx(1 / (0.5**2 + 2 * 0.25**2) / 4)

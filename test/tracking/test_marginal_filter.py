@@ -17,6 +17,7 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
+from bayes3d_ros.sampling import student_t
 from bayes3d_ros.tracking import marginal_filter as tracking
 from bayes3d_ros.validation.statistics.agreement import ratio_and_error
 
@@ -118,7 +119,7 @@ def test_evidence_is_that_of_plain_monte_carlo(scene):
     _, own = tracking.shares(HYPOTHESES)
     state = tracking.start(before, own, 0.03)
     rng = jax.random.key(7)
-    tangent = tracking._draw_t(rng, 40000) * jnp.array([0.006] * 3 + [0.02] * 3)
+    tangent = student_t.draw_standard(rng, 40000, 6, 5.0) * jnp.array([0.006] * 3 + [0.02] * 3)
     drawn = se3.product(se3.exp_about(tangent, jnp.zeros(3)), jnp.asarray(before, jnp.float32))
     parts = [
         log_marginal(log_likelihood_of_cameras(part, scene.world, image, scene.library, grid.coarse, WINDOW), grid)

@@ -1,12 +1,5 @@
-"""From the proposal to the target by steps: resample and move between them (Del Moral et al. 2006).
-
-The likelihood of an object's pose is sharp and uneven; a mixture that fits it well leaves weights that differ by a few
-nats, one that misses something by tens. So an object is not weighted at once but along the path q^(1-b) target^b, b
-from 0 to 1, with Metropolis-Hastings moves at every b. The exponents come from pilot draws that are thrown away: they
-depend on the image and the ancestor only, and the evidence stays unbiased. Where particles meet a peak that the pilots
-did not, a step is shortened by the particles' own weights: consistent, with a bias that falls as one over their number
-(Beskos et al. 2016), where an unbiased estimate would rest on a single particle.
-"""
+"""Metropolis-Hastings moves of one object of a scene, between the proposal and the target: a jump to where the object
+looks alike, a random walk, a fresh draw of the proposal."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -18,46 +11,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, shifted
 from bayes3d_ros.parsing.proposal import Modes, Proposal, propose
-from bayes3d_ros.sampling.resampling import effective_fraction
+from bayes3d_ros.sampling.metropolis import accept
 
 Tree = TypeVar("Tree", bound=Any)
-LEVELS = 6  # of the plan
-MOST_LEVELS = 16
-TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
-_EVEN = 0.33  # share of the effective draws that a step of the exponent keeps
 _STEPS = (0.05, 1.0)  # of a component's scale, a random walk's: the likelihood's peaks are of all widths
 _LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
-
-
-def exponents(log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"]) -> Float[Array, "L"]:
-    """Increasing exponents up to 1 (repeated at the end). Each step keeps a third of the effective draws:
-    draws with these weights from q, log_ratio = log target - log q."""
-    log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
-
-    def following(b: Array, _) -> tuple[Array, Array]:
-        c = longest_step(b, jnp.ones_like(b), log_ratio, jax.nn.log_softmax(log_weight + b * log_ratio))
-        return c, c
-
-    return jax.lax.scan(following, jnp.float32(0.0), None, length=LEVELS)[1].at[-1].set(1.0)
-
-
-def longest_step(
-    b: Float[Array, ""], most: Float[Array, ""], log_ratio: Float[Array, "N"], log_weight: Float[Array, "N"]
-) -> Float[Array, ""]:
-    """The largest exponent up to `most` that keeps a third of the draws effective that are so now."""
-
-    def enough(c: Array) -> Array:
-        step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
-        return effective_fraction(log_weight + step) >= _EVEN * effective_fraction(log_weight)
-
-    def halve(bounds, _):
-        low, high = bounds
-        middle = b + jnp.sqrt((low - b) * (high - b))  # steps span orders of magnitude
-        good = enough(middle)
-        return (jnp.where(good, middle, low), jnp.where(good, high, middle)), None
-
-    (c, _), _ = jax.lax.scan(halve, (b + 1e-4 * (most - b), most), None, length=12)
-    return jnp.where(enough(most), most, c)
 
 
 def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
@@ -119,5 +77,4 @@ def move_new(
     )
     to = extend(at.ancestor, new)
     log_accept = b * (to.log_ratio - at.log_ratio) + jnp.where(move == 2, 0.0, to.log_q - at.log_q)
-    accept = jnp.log(jax.random.uniform(accept_key, log_accept.shape)) < log_accept  # NaN: neither has weight
-    return jax.tree.map(lambda a, b: jnp.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b), to, at)
+    return accept(accept_key, log_accept, to, at)

@@ -1,0 +1,34 @@
+"""Student t distributions in several dimensions."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+def stretch(key: PRNGKeyArray, count: int, freedom: float) -> Float[Array, "N 1"]:
+    """What draws of a normal distribution are multiplied by to be draws of a t with so many degrees of freedom."""
+    return jnp.sqrt(freedom / jax.random.chisquare(key, freedom, shape=(count, 1)))
+
+
+def draw_standard(key: PRNGKeyArray, count: int, dimensions: int, freedom: float) -> Float[Array, "N D"]:
+    """Draws of a standard t: centre 0, scale 1."""
+    gauss_key, stretch_key = jax.random.split(key)
+    factor = stretch(stretch_key, count, freedom)
+    return jax.random.normal(gauss_key, (count, dimensions)) * factor
+
+
+def log_density(
+    square: Float[Array, "*n"],
+    dimensions: int,
+    freedom: float,
+    log_determinant: Float[Array, "*n"] | float = 0.0,
+) -> Float[Array, "*n"]:
+    """log density, given the squared distance from the centre in units of the scale, and the log determinant of the
+    scale (1 for a standard t)."""
+    log_norm = (
+        jax.scipy.special.gammaln((freedom + dimensions) / 2)
+        - jax.scipy.special.gammaln(freedom / 2)
+        - dimensions / 2 * jnp.log(freedom * jnp.pi)
+        - log_determinant
+    )
+    return log_norm - (freedom + dimensions) / 2 * jnp.log1p(square / freedom)

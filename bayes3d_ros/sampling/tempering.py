@@ -1,0 +1,82 @@
+"""Tempered weights: exponents of a path q^(1-b) target^b, and how far log values have to be flattened, each found by
+bisection so that enough draws stay effective."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from bayes3d_ros.sampling.resampling import effective_fraction
+
+_LEAST_LOG_BETA = -16.0
+
+
+def exponents(
+    log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"], levels: int, keep: float
+) -> Float[Array, "L"]:
+    """`levels` increasing exponents up to 1 (repeated at the end). Each step keeps this share of the effective draws:
+    draws with these weights from q, log_ratio = log target - log q."""
+    log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
+
+    def following(b: Array, _) -> tuple[Array, Array]:
+        c = longest_step(b, jnp.ones_like(b), log_ratio, jax.nn.log_softmax(log_weight + b * log_ratio), keep)
+        return c, c
+
+    return jax.lax.scan(following, jnp.float32(0.0), None, length=levels)[1].at[-1].set(1.0)
+
+
+def longest_step(
+    b: Float[Array, ""],
+    most: Float[Array, ""],
+    log_ratio: Float[Array, "N"],
+    log_weight: Float[Array, "N"],
+    keep: float,
+) -> Float[Array, ""]:
+    """The largest exponent up to `most` that keeps this share of the draws effective that are so now."""
+
+    def enough(c: Array) -> Array:
+        step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
+        return effective_fraction(log_weight + step) >= keep * effective_fraction(log_weight)
+
+    def between(low: Array, high: Array) -> Array:
+        return b + jnp.sqrt((low - b) * (high - b))  # steps span orders of magnitude
+
+    c = _largest(enough, (b + 1e-4 * (most - b), most), between, halvings=12)
+    return jnp.where(enough(most), most, c)
+
+
+def tempered(log_value: Float[Array, "*M D"], effective: float) -> Float[Array, "*M D"]:
+    """Weights exp(beta v), normalised along the last axis, with beta <= 1 as large as keeps `effective` draws."""
+
+    def weights(log_beta: Float[Array, "*M"]) -> Float[Array, "*M D"]:
+        return jax.nn.softmax(jnp.exp(log_beta)[..., None] * log_value, -1)
+
+    def enough(log_beta: Float[Array, "*M"]) -> Bool[Array, "*M"]:
+        return 1 / (weights(log_beta) ** 2).sum(-1) >= effective
+
+    shape = log_value.shape[:-1]
+    return weights(_largest(enough, (jnp.full(shape, _LEAST_LOG_BETA), jnp.zeros(shape)), _middle, halvings=14))
+
+
+def _middle(low: Array, high: Array) -> Array:
+    return 0.5 * (low + high)
+
+
+def _largest(
+    holds: Callable[[Array], Array],
+    bounds: tuple[Array, Array],
+    between: Callable[[Array, Array], Array],
+    halvings: int,
+) -> Array:
+    """The largest value within bounds for which a condition holds that holds up to it and not beyond, from below; the
+    lower bound is taken to fulfil it."""
+
+    def halve(bounds: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
+        low, high = bounds
+        middle = between(low, high)
+        good = holds(middle)
+        return (jnp.where(good, middle, low), jnp.where(good, high, middle)), None
+
+    (low, _), _ = jax.lax.scan(halve, bounds, None, length=halvings)
+    return low
