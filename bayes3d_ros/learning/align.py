@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.learning.segment import Surface, middle
 
 _PRIOR = 0.015, 0.015, np.deg2rad(0.8)  # standard deviations of a pose's error at the object: metres, metres, radians
@@ -65,7 +66,7 @@ def align_views(surfaces: list[Surface]) -> list[Shift]:
                 if i != j:
                     slope, residual = _between(clouds[i], clouds[j], shifts[i], shifts[j], reach)
                     scale = max(reach / 3, _NOISE)
-                    weight = 1 / (1 + (residual / scale) ** 2) ** 2 / (_CORRELATED * _NOISE**2)
+                    weight = 1 / geman_mcclure(residual, scale) / (_CORRELATED * _NOISE**2)
                     columns = np.r_[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
                     information[np.ix_(columns, columns)] += (slope * weight[:, None]).T @ slope
                     gradient[columns] += slope.T @ (weight * residual)

@@ -5,10 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.coarse_search import Evidence
+from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 
 _ROUNDS = 10
 _WIDE, _TIGHT = 0.02, 0.006  # metres, how far off a point may be, first and last
@@ -19,31 +21,21 @@ def align(
 ) -> tuple[Placement, Float[Array, "N 3 3"]]:
     """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over sketch points, per metre^2 of
     residual variance."""
-    R_table, t_table = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
-    axes = [R_table[:, a] for a in range(3)]
-    height, width = evidence.depth.shape
 
     def step(placement: Placement, tolerance: Float[Array, ""]):
         T = T_camera_object(placement, library, table)
-        points, normals = library.sketch[placement.type], library.sketch_normal[placement.type]
-        p = (T[:, None, :3, :3] * points[:, :, None, :]).sum(-1) + T[:, None, :3, 3]
-        n = (T[:, None, :3, :3] * normals[:, :, None, :]).sum(-1)
-        z = jnp.maximum(p[..., 2], 0.02)
-        u = jnp.round(p[..., 0] / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
-        v = jnp.round(p[..., 1] / z * image.focal[1] + image.centre[1]).astype(jnp.int32)
-        seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
+        surface = in_camera(library.sketch[placement.type], library.sketch_normal[placement.type], T)
+        p, n = surface
+        z, u, v, seen = pixels_of(p, image)
         observed = evidence.depth[v, u]
         q = observed[..., None] * jnp.stack([image.ray_x[u], image.ray_y[v], jnp.ones_like(observed)], -1)
         residual = (n * (q - p)).sum(-1)
         gap = jnp.abs(observed - z)
         # What faces away is not what returned, near as it may lie: a wall is thinner than the tolerance.
-        facing = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
-        weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & (facing > 0.15), 1.0, 0.0)
-        weight = weight * evidence.unexplained[v, u] / (1 + (residual / tolerance) ** 2) ** 2
-        centre = placement.x[:, None] * axes[0] + placement.y[:, None] * axes[1] + t_table
-        turn = jnp.cross(axes[2], p - centre[:, None])
-        J = jnp.stack([(n * axes[0]).sum(-1), (n * axes[1]).sum(-1), (n * turn).sum(-1)], -1)
+        facing = surface.cosine() > 0.15
+        weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & facing, 1.0, 0.0)
+        weight = weight * evidence.unexplained[v, u] / geman_mcclure(residual, tolerance)
+        J = normal_motion(surface, placement, table)
         information = jnp.einsum("np,npa,npb->nab", weight, J, J)
         # A weak pull to where the hypothesis stands: 2 cm and 0.3 rad, for directions that the data leave open.
         damped = information + jnp.diag(tolerance**2 / jnp.array([0.02, 0.02, 0.3]) ** 2)

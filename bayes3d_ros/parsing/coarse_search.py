@@ -16,6 +16,7 @@ from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
+from bayes3d_ros.parsing.surface_samples import NEAREST, pixels_of
 
 CELL = 0.02  # metres
 YAWS = 24
@@ -88,7 +89,7 @@ def _score(
     height, width = evidence.depth.shape
     x, y, z = point
     facing = jnp.maximum(-(normal.x * x + normal.y * y + normal.z * z), 0.0) * jax.lax.rsqrt(x * x + y * y + z * z)
-    inverse = 1 / jnp.maximum(z, 0.02)
+    inverse = 1 / jnp.maximum(z, NEAREST)
     u = jnp.round(x * inverse * image.focal[0] + image.centre[0]).astype(jnp.int32)
     v = jnp.round(y * inverse * image.focal[1] + image.centre[1]).astype(jnp.int32)
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -222,10 +223,6 @@ def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Fl
     y = (jnp.arange(shape[1]) + 0.5) * CELL - table.size[1] / 2
     grid = jnp.stack(jnp.meshgrid(x, y, heights, indexing="ij"), -1)
     point = (table.T_camera_table[:3, :3] * grid[..., None, :]).sum(-1) + table.T_camera_table[:3, 3]
-    z = jnp.maximum(point[..., 2], 0.02)
-    uv = jnp.round(point[..., :2] / z[..., None] * image.focal + image.centre).astype(jnp.int32)
-    height, width = image.depth.shape
-    seen = ((uv >= 0) & (uv < jnp.array([width, height]))).all(-1) & (point[..., 2] > 0.02)
-    u, v = jnp.clip(uv[..., 0], 0, width - 1), jnp.clip(uv[..., 1], 0, height - 1)
-    past = seen & (image.pixel_class[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
+    z, u, v, inside = pixels_of(point, image)
+    past = inside & (point[..., 2] > NEAREST) & (image.pixel_class[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
     return jnp.exp(-1.5 * past.sum(-1))

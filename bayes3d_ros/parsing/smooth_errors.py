@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.objects.placement import Placement, T_camera_object
 from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 
 _POINTS = 48  # of an object's sketch
 _BEHIND = 0.01  # metres behind what is seen in front, from which a point is hidden
@@ -46,26 +47,18 @@ def offset_covariance(
 ) -> Float[Array, "N M 3 3"]:
     """Covariance of (x, y, yaw) between each object and its picture; objects [N, M], scenes as in `smc.Population`."""
     image, library, table = context
-    height, width = image.depth.shape
     half = window // 2
     type_id, face = jnp.maximum(objects.type, 0), jnp.maximum(objects.face, 0)
-    T = T_camera_object(objects._replace(type=type_id, face=face), library, table)[..., None, :, :]
+    T = T_camera_object(objects._replace(type=type_id, face=face), library, table)
     points, normals = library.sketch[type_id][..., :_POINTS, :], library.sketch_normal[type_id][..., :_POINTS, :]
-    p = (T[..., :3, :3] * points[..., None, :]).sum(-1) + T[..., :3, 3]
-    n = (T[..., :3, :3] * normals[..., None, :]).sum(-1)
-    z = jnp.maximum(p[..., 2], 0.02)
-    u = jnp.round(p[..., 0] / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
-    v = jnp.round(p[..., 1] / z * image.focal[1] + image.centre[1]).astype(jnp.int32)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u, v = jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1)
+    surface = in_camera(points, normals, T)
+    p, _ = surface
+    _, u, v, inside = pixels_of(p, image)
     front = scenes[jnp.arange(len(scenes))[:, None, None], v + half, u + half]
-    cosine = -(n * p).sum(-1) / jnp.linalg.norm(p, axis=-1)
+    cosine = surface.cosine()
     facing = cosine > 0.1
     seen = inside & facing & (p[..., 2] < front + _BEHIND) & (image.pixel_class[v, u] != NO_RETURN)
-    R, origin = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
-    centre = objects.x[..., None] * R[:, 0] + objects.y[..., None] * R[:, 1] + origin
-    turn = jnp.cross(R[:, 2], p - centre[..., None, :])
-    J = jnp.stack([(n * R[:, 0]).sum(-1), (n * R[:, 1]).sum(-1), (n * turn).sum(-1)], -1) * seen[..., None]
+    J = normal_motion(surface, objects, table) * seen[..., None]
     hold = _HELD * seen.sum(-1)[..., None, None] * jnp.diag(jnp.array([1.0, 1.0, _ARM**2]))
     H = jnp.einsum("nmpa,nmpb->nmab", J, J) + hold + 1e-6 * jnp.eye(3)
     gain = jnp.linalg.solve(H, (J * cosine[..., None]).swapaxes(-1, -2))
@@ -73,7 +66,7 @@ def offset_covariance(
     field = error.bias**2 + error.waviness**2 * jnp.exp(-0.5 * apart / error.length**2)
     smooth = jnp.einsum("nmap,nmpq,nmbq->nmab", gain, field, gain)
     share = seen.sum(-1) / jnp.maximum(facing.sum(-1), 1)
-    off = _OUTLINE * T[..., 0, 2, 3] / image.focal[0] / jnp.maximum(share, _SMALLEST_SHARE)
+    off = _OUTLINE * T[..., 2, 3] / image.focal[0] / jnp.maximum(share, _SMALLEST_SHARE)
     outline = off[..., None, None] ** 2 * jnp.diag(jnp.array([1.0, 1.0, 1 / (2 * _ARM) ** 2]))
     return smooth + jnp.where((error.bias > 0) | (error.waviness > 0), outline, 0.0)
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
+from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.posterior.types import ParseError
 
@@ -68,7 +69,7 @@ def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5
         if near.sum() < 100:
             raise ParseError(f"no table in sight: the best plane holds {near.sum()} returns, expected at least 100")
         p, h, s = points[near], height[near], scale[near]
-        weight = 1 / (p[:, 2] ** 4 * (1 + (h / s) ** 2) ** 2)
+        weight = 1 / (p[:, 2] ** 4 * geman_mcclure(h, s))
         mean = (weight[:, None] * p).sum(0) / weight.sum()
         spread = np.einsum("n,na,nb->ab", weight, p - mean, p - mean)
         normal = np.linalg.eigh(spread)[1][:, 0]

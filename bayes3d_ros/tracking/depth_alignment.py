@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.camera_score import World, render_cameras
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -43,7 +44,7 @@ def aligned(
     def step(mean: Array, reach: Array) -> tuple[Array, None]:
         depth, slope, seen = rendered_slopes(pose, mean, image, scene)
         residual = jnp.where(seen, image.depth - depth, 0.0)
-        weight = jnp.where(seen, 1 / (1 + (residual / reach) ** 2) ** 2, 0.0) / reach**2
+        weight = jnp.where(seen, 1 / geman_mcclure(residual, reach), 0.0) / reach**2
         pull = jnp.einsum("ahw,hw,hw->a", slope, weight, residual, precision=jax.lax.Precision.HIGHEST)
         square = information(slope * scale[:, None, None], weight) + 0.01 * jnp.eye(6)
         return mean + scale * jnp.linalg.solve(square, scale * pull), None
