@@ -67,6 +67,15 @@ class FilterState(NamedTuple):
     p_outlier: Float[Array, ""]
 
 
+class Observed(NamedTuple):
+    """A frame, and what is known of it before it is looked at."""
+
+    image: ScoredImage
+    scene: TrackedScene
+    grid: NoiseGrid
+    motion: Motion  # since the frame before
+
+
 class FilterInfo(NamedTuple):
     """What a frame said."""
 
@@ -154,10 +163,7 @@ def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D
 def step(
     key: PRNGKeyArray,
     state: FilterState,
-    image: ScoredImage,
-    scene: TrackedScene,
-    grid: NoiseGrid,
-    motion: Motion,
+    observed: Observed,
     hypotheses: int,
     window: int,
     devices: tuple[jax.Device, ...] = (),
@@ -165,6 +171,7 @@ def step(
     """The posterior one frame later, with `hypotheses` images scored or rendered in all; of the state's particles there
     have to be as many as `shares` says. The work is shared out over `devices`; with several of them `state` has to be
     on all (`on_all`)."""
+    image, scene, grid, motion = observed
     _, own = shares(hypotheses)
     if len(state.log_weight) != own:
         raise ValueError(f"expected {own} particles of {hypotheses} hypotheses, got {len(state.log_weight)}")
@@ -179,7 +186,7 @@ def step(
     def score(T: Float[Array, "D 4 4"], noise: Noise) -> Float[Array, "D S P"]:
         return every_camera(T, scene.world, image, scene.library, noise)
 
-    chart = _search(search_key, state, expected, image, scene, motion, hypotheses, score, devices)
+    chart = _search(search_key, state, expected, observed, hypotheses, score, devices)
     T = _propose(draw_key, chart, expected, motion, own)
     by_ancestor = over_devices(log_predictive, devices)(T, expected, log_share, motion)
     log_prior = jax.nn.logsumexp(by_ancestor, 1)
@@ -224,15 +231,14 @@ def _search(
     key: PRNGKeyArray,
     state: FilterState,
     expected: Float[Array, "K 4 4"],
-    image: ScoredImage,
-    scene: TrackedScene,
-    motion: Motion,
+    observed: Observed,
     hypotheses: int,
     score: Callable[[Float[Array, "D 4 4"], Noise], Float[Array, "D S P"]],
     devices: tuple[jax.Device, ...],
 ) -> _Chart:
     """A distribution near the likelihood's: draws of the predictive at a blurred noise, the best of them aligned to the
     image, the best of those narrowed round by round."""
+    image, scene, _, motion = observed
     each, _ = shares(hypotheses)
     p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
     blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]

@@ -119,8 +119,9 @@ class CameraTracker:
             np.float32(settings.speed_change * seconds), np.float32(settings.turn_change * seconds)
         )
         key = frame_key(settings.seed, frame.stamp_ns)
+        observed = marginal_filter.Observed(image, known.scene, grid, motion)
         particles, info = marginal_filter.step(
-            key, before, image, known.scene, grid, motion, settings.hypotheses, settings.window, self._devices
+            key, before, observed, settings.hypotheses, settings.window, self._devices
         )
         smooth, explained, in_sight = self._smooth(info.T_camera_world, image, known.scene, self._error)
         turns = _turns(particles.T_camera_world)

@@ -128,9 +128,9 @@ def test_evidence_is_that_of_plain_monte_carlo(scene):
     log_z = np.concatenate([np.asarray(part, float) for part in parts])
     plain = np.logaddexp.reduce(log_z) - np.log(len(log_z))
     error_plain = ratio_and_error(log_z, plain)[1]
+    observed = tracking.Observed(image, scene, grid, motion)
     runs = [
-        float(tracking.step(jax.random.key(k), state, image, scene, grid, motion, HYPOTHESES, WINDOW)[1].log_evidence)
-        for k in range(40)
+        float(tracking.step(jax.random.key(k), state, observed, HYPOTHESES, WINDOW)[1].log_evidence) for k in range(40)
     ]
     mean, error = ratio_and_error(runs, plain)
     assert np.hypot(error, error_plain) < 0.2
@@ -150,9 +150,8 @@ def test_a_camera_is_followed_and_its_covariance_holds(scene):
     distances, compiled = [], None
     for k, truth in enumerate(poses):
         image = image_from(truth, scene, 0.002, rng)
-        state, info = tracking.step(
-            jax.random.key(k), state, image, scene, for_returns(grid, image.pixel_class), motion, HYPOTHESES, WINDOW
-        )
+        observed = tracking.Observed(image, scene, for_returns(grid, image.pixel_class), motion)
+        state, info = tracking.step(jax.random.key(k), state, observed, HYPOTHESES, WINDOW)
         compiled = compiled or tracking.step._cache_size()
         change = se3.product(jnp.asarray(truth, jnp.float32), se3.inverse(info.T_camera_world))
         off = se3.log_about(change, jnp.asarray(truth[:3, 3], jnp.float32))
@@ -170,4 +169,4 @@ def test_too_few_hypotheses_or_other_numbers_of_particles_are_refused(scene):
     motion = tracking.Motion(jnp.float32(0.01), jnp.float32(0.03))
     state = tracking.start(looking(0.1), 10, 0.002)
     with pytest.raises(ValueError, match="particles of 2048 hypotheses, got 10"):
-        tracking.step(jax.random.key(0), state, image, scene, grid, motion, HYPOTHESES, WINDOW)
+        tracking.step(jax.random.key(0), state, tracking.Observed(image, scene, grid, motion), HYPOTHESES, WINDOW)
