@@ -12,6 +12,17 @@ def pose_matrix(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, 
     return T
 
 
+def slide(
+    x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], yaw: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 4 4"]:
+    """The motion by (x, y) along a plane z = 0, after a turn about z; metres and radians."""
+    T, c, s = np.zeros((*np.shape(yaw), 4, 4)), np.cos(yaw), np.sin(yaw)
+    T[..., 0, 0], T[..., 0, 1], T[..., 1, 0], T[..., 1, 1] = c, -s, s, c
+    T[..., 2, 2] = T[..., 3, 3] = 1
+    T[..., 0, 3], T[..., 1, 3] = x, y
+    return T
+
+
 def direction(
     azimuth: Float[np.ndarray, "*n"] | float, elevation: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n 3"]:

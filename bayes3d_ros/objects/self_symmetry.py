@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from bayes3d_ros.geometry.poses import slide
+
 ALIKE = 7  # kept for every face
 _TURNS = 60
 _POINTS = 64
@@ -127,16 +129,14 @@ def _squared(
     what is symmetric in its voxels is so exactly."""
     squared = shift.copy()
     for k, (x, y, yaw) in enumerate(shift):
-        c, s = np.cos(yaw), np.sin(yaw)
-        slide = np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]])
-        turn = (np.linalg.inv(T_contact_object) @ slide @ T_contact_other)[:3, :3]
+        turn = (np.linalg.inv(T_contact_object) @ slide(x, y, yaw) @ T_contact_other)[:3, :3]
         square = np.round(turn)
         if np.abs(turn - square).max() > _SQUARE_WITHIN or np.linalg.det(square) != 1:
             continue
         about = np.eye(4)
         about[:3, :3], about[:3, 3] = square, centre - square @ centre
-        slide = T_contact_object @ about @ np.linalg.inv(T_contact_other)
-        squared[k] = *slide[:2, 3], np.arctan2(slide[1, 0], slide[0, 0]) % (2 * np.pi)
+        moved = T_contact_object @ about @ np.linalg.inv(T_contact_other)
+        squared[k] = *moved[:2, 3], np.arctan2(moved[1, 0], moved[0, 0]) % (2 * np.pi)
     return squared
 
 
