@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame, reduced, scored_size
-from bayes3d_ros.geometry.poses import pose_matrix
+from bayes3d_ros.geometry.poses import pose_matrix, slide
 from bayes3d_ros.likelihood import noise as noise_model
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.likelihood.noise import NoiseGrid
@@ -21,9 +21,9 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
-from bayes3d_ros.parsing.search import Context
 from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.parsing.support_plane import find_plane, table_depth, table_frame, usable_share, workspace
 from bayes3d_ros.posterior.summarise import summarise
@@ -290,15 +290,11 @@ class SceneParser:
     def _poses(self, objects: Placement, table: Table, plane: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S M 4 4"]:
         """T_camera_object in float64 numpy: sample counts differ from frame to frame, and must not recompile."""
         T_contact = np.asarray(self._arrays.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
-        slide = np.zeros((*objects.type.shape, 4, 4))
-        c, s = np.cos(objects.yaw), np.sin(objects.yaw)
-        slide[..., 0, 0], slide[..., 0, 1], slide[..., 1, 0], slide[..., 1, 1] = c, -s, s, c
-        slide[..., 2, 2] = slide[..., 3, 3] = 1
-        slide[..., 0, 3], slide[..., 1, 3] = objects.x, objects.y
         moved = np.broadcast_to(np.eye(4), (len(plane), 1, 4, 4)).copy()
         moved[:, 0, :3, :3] = Rotation.from_rotvec(plane * [1, 1, 0]).as_matrix()
         moved[:, 0, 2, 3] = plane[:, 2]
-        return np.asarray(table.T_camera_table, np.float64) @ moved @ slide @ T_contact
+        along = slide(*(np.asarray(a) for a in (objects.x, objects.y, objects.yaw)))
+        return np.asarray(table.T_camera_table, np.float64) @ moved @ along @ T_contact
 
     def _reconstruct(self, frame, T_camera_table, samples, summary):
         """Depth and labels of the best scene at the input's size."""

@@ -8,7 +8,8 @@ sampler's lists, p_k times the backward kernels of all stages. Weighted scenes s
 Moral et al. 2006, along the tempered path of Neal 1996); the evidence stays as the stages estimated it.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +19,10 @@ from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.proposal import Proposal, log_density
-from bayes3d_ros.parsing.search import Context, conflicts
+from bayes3d_ros.parsing.search import conflicts
 from bayes3d_ros.sampling.resampling import distinct_fraction, normalised, resample
 
 _COOLING = 0.7  # ratio of neighbouring exponents: about three quarters of the particles stay effective
@@ -87,17 +89,12 @@ def _move(
     heats: Int[Array, ""],
 ) -> WeightedScenes:
     """The object in slot m of every scene."""
-    context, grid, empty, window, overlap_limit, ess_threshold = frame
-    image, library, table = context
+    context, grid, empty, window, overlap_limit, _ = frame
+    _, library, table = context
     particles, slots = state.solo_gain.shape
     others = jnp.arange(slots) != m
 
-    def with_other(j: Array, scenes: Array) -> Array:
-        other = _slot(state.objects, j)
-        return jax.lax.cond(j == m, lambda: scenes, lambda: render_objects(other, scenes, *context, window))
-
-    bare = jnp.broadcast_to(empty.scene, state.scenes.shape)
-    without = jax.lax.fori_loop(0, count, with_other, bare)
+    without = _scenes_without(state, m, count, frame)
     gap = jnp.abs(state.solo_gain - jnp.take_along_axis(state.solo_gain, m[None, None], 1))
     unclear = jnp.where(others & (jnp.arange(slots) < count), gap, jnp.inf).min() < _APART
     # Behind the last slot: not among those that an object may conflict with.
@@ -128,19 +125,49 @@ def _move(
         solo_gain = state.solo_gain[ancestor].at[:, m].set(own)
         return with_terms(ancestor, placement, grid_without[ancestor] + gain(ancestor, placement), solo_gain)
 
+    start = with_terms(everyone, mine, state.loglik_grid, state.solo_gain)
+    end, log_weight = _heat_and_cool(key, start, state.log_weight, extend, proposal, heats, frame)
+    objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
+    scenes = render_objects(end.new, without[end.ancestor], *context, window)
+    solo_gain = cast(Array, end.solo_gain)
+    return WeightedScenes(
+        objects, solo_gain, state.lineage[end.ancestor], scenes, end.loglik_grid, end.log_likelihood, log_weight
+    )
+
+
+def _scenes_without(
+    state: WeightedScenes, m: Int[Array, ""], count: Int[Array, ""], frame: Frame
+) -> Float[Array, "N Hp Wp"]:
+    """Padded depth of the scenes without the object in slot m."""
+
+    def with_other(j: Array, scenes: Array) -> Array:
+        other = _slot(state.objects, j)
+        return jax.lax.cond(j == m, lambda: scenes, lambda: render_objects(other, scenes, *frame.context, frame.window))
+
+    bare = jnp.broadcast_to(frame.empty.scene, state.scenes.shape)
+    return jax.lax.fori_loop(0, count, with_other, bare)
+
+
+def _heat_and_cool(
+    key: PRNGKeyArray,
+    start: Proposed,
+    log_weight: Float[Array, "N"],
+    extend: Callable[[Int[Array, "N"], Placement], Proposed],
+    proposal: Proposal,
+    heats: Int[Array, ""],
+    frame: Frame,
+) -> tuple[Proposed, Float[Array, "N"]]:
+    """From weighted draws of the target, down to the least exponent and up again, to others with their log weights."""
+    _, library, table = frame.context
+
     def step(number: Array, carry: tuple) -> tuple:
         placed, log_weight, b = carry
         c = jnp.minimum(_COOLING ** jnp.minimum(number + 1, 2 * heats - number - 1).astype(jnp.float32), 1.0)
         step = jnp.where(jnp.isfinite(placed.log_ratio), (c - b) * placed.log_ratio, -jnp.inf)
         log_weight, _ = normalised(log_weight + step)
         resample_key, move_key = jax.random.split(jax.random.fold_in(key, number))
-        placed, log_weight = resample(resample_key, placed, log_weight, ess_threshold)
+        placed, log_weight = resample(resample_key, placed, log_weight, frame.ess_threshold)
         return move_new(move_key, placed, c, (number + 1) % 3, extend, proposal, library, table), log_weight, c
 
-    start = with_terms(everyone, mine, state.loglik_grid, state.solo_gain), state.log_weight, jnp.float32(1.0)
-    end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, start)
-    objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
-    scenes = render_objects(end.new, without[end.ancestor], *context, window)
-    return WeightedScenes(
-        objects, end.solo_gain, state.lineage[end.ancestor], scenes, end.loglik_grid, end.log_likelihood, log_weight
-    )
+    end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, (start, log_weight, jnp.float32(1.0)))
+    return end, log_weight

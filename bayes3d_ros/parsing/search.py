@@ -1,6 +1,7 @@
 """From the whole space of one object to a proposal: cells scored with sketches, the best of them aligned to the data,
 the best of those scored with the model itself and narrowed round by round."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal, near_peak, pea
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage, halved
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SKETCH_POINTS, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, Table, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     YAWS,
@@ -24,6 +25,7 @@ from bayes3d_ros.parsing.coarse_search import (
     sketch_score,
 )
 from bayes3d_ros.parsing.consensus import MANY_OUTLIERS, consensus
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mode_search import (
     FINALISTS,
     PILOT_DRAWS,
@@ -55,6 +57,9 @@ STEP_KEEPS = 0.33  # share of the effective draws that a step of the exponent ke
 _WORTH = 5.0  # nats: below, no candidate is worth a search
 
 
+Gains = Callable[[Placement], Float[Array, "N"]]  # log likelihoods that objects [N] gain
+
+
 class LeadScene(NamedTuple):
     """A scene that stands for the population: its depth image, its log likelihood on the grid of noise, its objects."""
 
@@ -62,14 +67,6 @@ class LeadScene(NamedTuple):
     loglik_grid: Float[Array, "S P"]
     objects: Placement  # [M]
     num_objects: Int[Array, ""]
-
-
-class Context(NamedTuple):
-    """What a frame and a library fix for a whole parse."""
-
-    image: ScoredImage
-    library: LibraryArrays
-    table: Table
 
 
 def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: Noise) -> Evidence:
@@ -183,58 +180,14 @@ def find_proposal(
     depth = scene.depth[half : half + height, half : half + width]
     evidence = evidence_left(depth, image, noise)
     found, score = candidates(scene, evidence, context, shape, overlap_limit)
-
-    fewer = 2 if width >= _WIDE else 1
-    small = Context(halved(image) if fewer == 2 else image, library, table)
-    small_depth = pad_scene(depth[::fewer, ::fewer], window)
-
-    blurred = noise._replace(sigma=jnp.maximum(noise.sigma, _BLUR))
-
-    def rough(placement: Placement) -> Float[Array, "N"]:
-        return fewer**2 * _gains(placement, small_depth, small, blurred, window)
-
-    def grid_with(placement: Placement) -> Float[Array, "S P"]:
-        """The scene's once the first of these objects explains what it does."""
-        first = take(placement, slice(1))
-        gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
-        return scene.loglik_grid + gain[0]
-
-    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), _CANDIDATES)
-    worth = gain[0] > _WORTH
-    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
-    found, _ = best_first(found, gain, _MODES)
-
-    def search() -> tuple[Modes, Pilots]:
-        narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
-        modes, value = narrow(narrow_key, found, rough)
-        modes, value = best_first(modes, value, _MODES)
-        value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, FINALISTS - 1)
-        modes, _ = best_first(modes, value, FINALISTS)
-        grid_then = grid_with(modes.placement)
-        noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
-        rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
-
-        def exact(placement: Placement) -> Float[Array, "N"]:
-            return _gains(placement, scene.depth, context, noise, window)
-
-        def marginal(placement: Placement) -> Float[Array, "N"]:
-            """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of
-            the image are compared by thousands of nats; at one noise level that comparison is off by ten."""
-            ancestor = jnp.zeros(placement.type.shape, jnp.int32)
-            gain = log_likelihood_gain(placement, ancestor, scene.depth[None], *context, near.coarse, window)
-            return log_marginal(scene.loglik_grid[rows] + gain, near)
-
-        modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
-        mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
-        return with_lookalikes(mixture, exact, library), pilots
-
-    def nothing() -> tuple[Modes, Pilots]:
-        modes = as_mixture(take(found, slice(FINALISTS)), jnp.zeros(FINALISTS))
-        mixture = with_lookalikes(modes, lambda placement: jnp.zeros(placement.type.shape), library)
-        nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.placement)
-        return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))
-
-    mixture, pilots = jax.lax.cond(worth, search, nothing)
+    rough = _rough_gains(depth, context, noise, window)
+    found, best = _starts(found, score, rough, library)
+    worth = best > _WORTH
+    mixture, pilots = jax.lax.cond(
+        worth,
+        lambda: _searched(key, found, rough, scene, context, grid, window),
+        lambda: _not_searched(found, library),
+    )
     cells = hidden_cells(image, table, shape)
     shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
     proposal = Proposal(mixture, cells / cells.sum(), shares)
@@ -242,3 +195,79 @@ def find_proposal(
     log_ratio = pilots.log_target - log_q
     path = exponents(log_ratio, log_q - pilots.log_drawn, PLANNED_LEVELS, STEP_KEEPS)
     return proposal, jnp.where(worth, path, jnp.ones(PLANNED_LEVELS))
+
+
+def _rough_gains(depth: Float[Array, "H W"], context: Context, noise: Noise, window: int) -> Gains:
+    """Gains over a scene at a noise that is no smaller than `_BLUR`, of a wide image at half its resolution."""
+    image, library, table = context
+    fewer = 2 if image.depth.shape[1] >= _WIDE else 1
+    small = Context(halved(image) if fewer == 2 else image, library, table)
+    small_depth = pad_scene(depth[::fewer, ::fewer], window)
+    blurred = noise._replace(sigma=jnp.maximum(noise.sigma, _BLUR))
+
+    def rough(placement: Placement) -> Float[Array, "N"]:
+        return fewer**2 * _gains(placement, small_depth, small, blurred, window)
+
+    return rough
+
+
+def _starts(
+    found: Hypotheses, score: Float[Array, "C"], rough: Gains, library: LibraryArrays
+) -> tuple[Hypotheses, Float[Array, ""]]:
+    """The hypotheses to follow uphill, and the gain of the best."""
+    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), _CANDIDATES)
+    best = gain[0]
+    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
+    found, _ = best_first(found, gain, _MODES)
+    return found, best
+
+
+def _searched(
+    key: PRNGKeyArray,
+    found: Hypotheses,
+    rough: Gains,
+    scene: LeadScene,
+    context: Context,
+    grid: NoiseGrid,
+    window: int,
+) -> tuple[Modes, Pilots]:
+    """A mixture about the modes that are uphill of what was found, and the pilots that it was fitted to."""
+    _, library, table = context
+    narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
+    modes, value = narrow(narrow_key, found, rough)
+    modes, value = best_first(modes, value, _MODES)
+    value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, FINALISTS - 1)
+    modes, _ = best_first(modes, value, FINALISTS)
+    grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
+    noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
+    rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
+
+    def exact(placement: Placement) -> Float[Array, "N"]:
+        return _gains(placement, scene.depth, context, noise, window)
+
+    def marginal(placement: Placement) -> Float[Array, "N"]:
+        """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of the
+        image are compared by thousands of nats; at one noise level that comparison is off by ten."""
+        ancestor = jnp.zeros(placement.type.shape, jnp.int32)
+        gain = log_likelihood_gain(placement, ancestor, scene.depth[None], *context, near.coarse, window)
+        return log_marginal(scene.loglik_grid[rows] + gain, near)
+
+    modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
+    mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
+    return with_lookalikes(mixture, exact, library), pilots
+
+
+def _grid_with(
+    first: Placement, scene: LeadScene, context: Context, grid: NoiseGrid, window: int
+) -> Float[Array, "S P"]:
+    """The scene's log likelihoods once one object [1] explains what it does."""
+    gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
+    return scene.loglik_grid + gain[0]
+
+
+def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:
+    """A mixture and pilots of the same shapes, which nothing uses."""
+    modes = as_mixture(take(found, slice(FINALISTS)), jnp.zeros(FINALISTS))
+    mixture = with_lookalikes(modes, lambda placement: jnp.zeros(placement.type.shape), library)
+    nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.placement)
+    return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))

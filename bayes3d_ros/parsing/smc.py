@@ -27,11 +27,12 @@ from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objec
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.proposal import SHARES, Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
-from bayes3d_ros.parsing.search import STEP_KEEPS, Context, LeadScene, conflicts, find_proposal
+from bayes3d_ros.parsing.search import STEP_KEEPS, LeadScene, conflicts, find_proposal
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
 from bayes3d_ros.sampling.tempering import longest_step
 
@@ -114,10 +115,7 @@ def step(
     resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
     ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
-    lead = ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])]
-    scene = LeadScene(
-        state.scenes[lead], state.loglik_grid[lead], jax.tree.map(lambda a: a[lead], state.objects), count
-    )
+    scene = _lead(state, ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])], count)
     proposal, exponents = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
 
     def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
@@ -159,6 +157,10 @@ def step(
         proposals=proposals,
         empty=state.empty,
     ), StageInfo(ess)
+
+
+def _lead(state: Population, lead: Int[Array, ""], count: Int[Array, ""]) -> LeadScene:
+    return LeadScene(state.scenes[lead], state.loglik_grid[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
 
 
 @partial(jax.jit, static_argnames=("window", "ess_threshold"))

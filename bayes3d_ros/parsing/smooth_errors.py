@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.objects.placement import Placement, T_camera_object
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 
 _POINTS = 48  # of an object's sketch

@@ -13,7 +13,8 @@ from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
-from bayes3d_ros.parsing.search import Context, conflicts
+from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.search import conflicts
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006
 BOARD, CUBE = 0, 1

@@ -10,7 +10,7 @@ from bayes3d_ros.likelihood.noise import log_marginal, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006

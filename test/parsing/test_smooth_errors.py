@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood.scene_score import pad_scene
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, offset_covariance
 
 WINDOW = 3

@@ -13,7 +13,7 @@ from bayes3d_ros.likelihood.noise import for_image
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.validation.experiments import calibration, calibration_points
 from bayes3d_ros.validation.reference import calibration_problem
 from bayes3d_ros.validation.reference.calibration_problem import (

@@ -23,8 +23,8 @@ from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.rejuvenation import Effort
-from bayes3d_ros.parsing.search import Context
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth, draw_points
 

@@ -24,7 +24,7 @@ from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES
 from bayes3d_ros.objects.placement import Placement, T_camera_object, log_prior
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.validation.reference.small_problems import SmallProblem
 
 YAW_BINS = 36  # that yaws are compared in

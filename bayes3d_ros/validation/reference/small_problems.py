@@ -18,7 +18,7 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
-from bayes3d_ros.parsing.search import Context
+from bayes3d_ros.parsing.context import Context
 
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 NEAR, FAR = 0.1, 2.0  # metres
