@@ -11,9 +11,7 @@ from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.coarse_search import Evidence
 from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
-
-_ROUNDS = 10
-_WIDE, _TIGHT = 0.02, 0.006  # metres, how far off a point may be, first and last
+from bayes3d_ros.parsing.tuning import SEARCH
 
 
 def align(
@@ -46,6 +44,7 @@ def align(
         )
         return moved, information
 
-    tolerances = _WIDE * (_TIGHT / _WIDE) ** jnp.linspace(0, 1, _ROUNDS)
+    first, last = SEARCH.align_first_tolerance, SEARCH.align_last_tolerance
+    tolerances = first * (last / first) ** jnp.linspace(0, 1, SEARCH.align_rounds)
     placement, information = jax.lax.scan(step, placement, tolerances)
     return placement, information[-1]

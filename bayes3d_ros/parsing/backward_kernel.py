@@ -14,8 +14,7 @@ from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.context import Context
-
-_FLOOR = 0.02
+from bayes3d_ros.parsing.tuning import SAMPLER
 
 
 class Empty(NamedTuple):
@@ -43,7 +42,7 @@ def log_last(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Arr
     """log of k times the backward kernel: the chance that the object in slot `count` came last of the k = count + 1."""
     present = jnp.arange(solo_gain.shape[1]) <= count
     share = jax.nn.softmax(jnp.where(present, -solo_gain, -jnp.inf), 1)
-    share = (1 - _FLOOR) * share + _FLOOR * present / (count + 1)
+    share = (1 - SAMPLER.last_floor) * share + SAMPLER.last_floor * present / (count + 1)
     return jnp.log((count + 1) * share[:, count])
 
 

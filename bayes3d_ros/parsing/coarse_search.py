@@ -17,15 +17,9 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.surface_samples import NEAREST, pixels_of
+from bayes3d_ros.parsing.tuning import SEARCH
 
-CELL = 0.02  # metres
-YAWS = 24
-MAX_CELLS = 512
-_BLOCK = 4  # cells a step
-# Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what it belongs to.
-_COARSE = (0.02, 0.5, 36)  # tolerance, penalty, points
-_REACH = 3  # cells: how far from unexplained returns an object's centre is looked for
-_NATS = 8.0  # what a pixel explained is worth, roughly
+_CELLS_A_STEP = 4  # scored at once, beside all orientations: no result depends on it
 
 
 class Evidence(NamedTuple):
@@ -101,12 +95,12 @@ def _score(
     matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * evidence.unexplained.ravel()[index]
     through = jnp.clip(gap / tolerance - 1, 0.0, 1.0) * evidence.explained.ravel()[index]
     pixels = area * image.focal[0] * image.focal[1]
-    return _NATS * pixels * ((matched - penalty * through) * known).sum(-1)
+    return SEARCH.nats_a_pixel * pixels * ((matched - penalty * through) * known).sum(-1)
 
 
 def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
     """Cells along x and y of the table's rectangle."""
-    return int(-(-table_size[0] // CELL)), int(-(-table_size[1] // CELL))
+    return int(-(-table_size[0] // SEARCH.cell)), int(-(-table_size[1] // SEARCH.cell))
 
 
 def cells_to_search(
@@ -114,15 +108,15 @@ def cells_to_search(
 ) -> tuple[Float[Array, "C 2"], Int[Array, ""]]:
     """Centres of the cells near unexplained returns, those with the most first, and how many there are."""
     xy = table_xy(evidence.depth, image, table)
-    index = jnp.floor((xy + table.size / 2) / CELL).astype(jnp.int32)
+    index = jnp.floor((xy + table.size / 2) / SEARCH.cell).astype(jnp.int32)
     inside = ((index >= 0) & (index < jnp.array(shape))).all(-1)
     index = jnp.clip(index, 0, jnp.array(shape) - 1)
     area = jnp.where(inside & (evidence.depth > 0), evidence.unexplained, 0.0)
     counts = jnp.zeros(shape).at[index[..., 0], index[..., 1]].add(area)
-    size = 2 * _REACH + 1
+    size = 2 * SEARCH.reach + 1
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
-    best, where = jax.lax.top_k(near.ravel(), min(MAX_CELLS, shape[0] * shape[1]))
-    centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * CELL - table.size / 2
+    best, where = jax.lax.top_k(near.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
+    centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * SEARCH.cell - table.size / 2
     return centre, (best >= 8).sum()
 
 
@@ -147,7 +141,7 @@ def score_cells(
     from bayes3d_ros.parsing.coarse_search_cpu import sketch_scores  # takes a while to import
 
     types, (face, yaw) = library.first.shape[0], _ways()
-    tolerance, penalty, points = _COARSE
+    tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points
     shape = (types, len(face))
     type_id, face, yaw = (jnp.broadcast_to(a, shape).ravel() for a in (jnp.arange(types)[:, None], face, yaw))
     zero = jnp.zeros(face.shape)
@@ -156,7 +150,7 @@ def score_cells(
     scores = sketch_scores(
         point,
         normal,
-        _NATS * _area(library, points) * image.focal[0] * image.focal[1],
+        SEARCH.nats_a_pixel * _area(library, points) * image.focal[0] * image.focal[1],
         centres @ table.T_camera_table[:3, :2].T,
         count,
         library.num_types,
@@ -165,13 +159,13 @@ def score_cells(
         tolerance,
         penalty,
     )
-    return scores.reshape(-1, types, NUM_FACES, YAWS)
+    return scores.reshape(-1, types, NUM_FACES, SEARCH.yaws)
 
 
 def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
     """Face and yaw of every orientation."""
-    face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(YAWS), indexing="ij"))
-    return face, (yaw + 0.5) * (2 * jnp.pi / YAWS)
+    face, yaw = (a.ravel() for a in jnp.meshgrid(jnp.arange(NUM_FACES), jnp.arange(SEARCH.yaws), indexing="ij"))
+    return face, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws)
 
 
 def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
@@ -189,9 +183,9 @@ def cells_in_turn(
 ) -> Float[Array, "C K 6 Y"]:
     """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
     types, (face, yaw) = library.first.shape[0], _ways()
-    ways = NUM_FACES * YAWS
-    tolerance, penalty, points = _COARSE
-    blocks = -(-count // _BLOCK)
+    ways = NUM_FACES * SEARCH.yaws
+    tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points
+    blocks = -(-count // _CELLS_A_STEP)
     along = [table.T_camera_table[:3, axis] for axis in range(2)]
 
     def of_type(type_id: Int[Array, ""], scores: Array) -> Array:
@@ -202,16 +196,16 @@ def cells_in_turn(
         area = _area(library, points)[type_id]
 
         def of_block(block: Int[Array, ""], scores: Array) -> Array:
-            xy = jax.lax.dynamic_slice(centres, (block * _BLOCK, 0), (_BLOCK, 2))
+            xy = jax.lax.dynamic_slice(centres, (block * _CELLS_A_STEP, 0), (_CELLS_A_STEP, 2))
             moved = (xy[:, :1] * along[0] + xy[:, 1:] * along[1])[..., None, None]
             here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
             value = _score(here, normal, area, evidence, image, tolerance, penalty)
-            value = value.reshape(_BLOCK, 1, NUM_FACES, YAWS)
-            return jax.lax.dynamic_update_slice(scores, value, (block * _BLOCK, type_id, 0, 0))
+            value = value.reshape(_CELLS_A_STEP, 1, NUM_FACES, SEARCH.yaws)
+            return jax.lax.dynamic_update_slice(scores, value, (block * _CELLS_A_STEP, type_id, 0, 0))
 
         return jax.lax.fori_loop(0, blocks, of_block, scores)
 
-    scores = jnp.full((centres.shape[0], types, NUM_FACES, YAWS), -jnp.inf)
+    scores = jnp.full((centres.shape[0], types, NUM_FACES, SEARCH.yaws), -jnp.inf)
     return jax.lax.fori_loop(0, library.num_types, of_type, scores)
 
 
@@ -219,8 +213,8 @@ def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Fl
     """How little the image says of something small in each cell: 1 where it would be hidden, falling with the number of
     heights above the cell at which the camera sees past."""
     heights = jnp.array([0.01, 0.02, 0.035, 0.05, 0.07])
-    x = (jnp.arange(shape[0]) + 0.5) * CELL - table.size[0] / 2
-    y = (jnp.arange(shape[1]) + 0.5) * CELL - table.size[1] / 2
+    x = (jnp.arange(shape[0]) + 0.5) * SEARCH.cell - table.size[0] / 2
+    y = (jnp.arange(shape[1]) + 0.5) * SEARCH.cell - table.size[1] / 2
     grid = jnp.stack(jnp.meshgrid(x, y, heights, indexing="ij"), -1)
     point = (table.T_camera_table[:3, :3] * grid[..., None, :]).sum(-1) + table.T_camera_table[:3, 3]
     z, u, v, inside = pixels_of(point, image)

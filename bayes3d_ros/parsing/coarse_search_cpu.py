@@ -11,8 +11,8 @@ from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
 _TARGET = "bayes3d_sketch_scores"  # to XLA
-_AT_ONCE = 8  # sketches: their points stay in the first-level cache, and are a multiple of a vector
-_NEAREST, _FARTHEST = 0.02, 1e6  # metres
+_SKETCHES_AT_ONCE = 8  # their points stay in the first-level cache, and are a multiple of a vector
+_NEAREST_M, _FARTHEST_M = 0.02, 1e6  # metres
 
 f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/loops.py`
 
@@ -33,7 +33,7 @@ def sketch_scores(
 ) -> Float[Array, "C K Y"]:
     """Scores of sketches of Y orientations of each type, moved to each of the first `count` places, -inf for other
     places and types. `worth` is what a point explained is worth at 1 m; `camera` is focal length and centre."""
-    known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST), 0.0, _FARTHEST)
+    known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST_M), 0.0, _FARTHEST_M)
     focal, centre = camera
     inputs = (
         *(a.astype(jnp.float32).ravel() for a in (point, normal, worth, moved, known, unexplained, explained)),
@@ -90,7 +90,7 @@ def _project(point, normal, first, count, stride, x0, y0, z0, image, points):
         x, y, z = point[at] + x0, point[at + second] + y0, point[at + third] + z0
         towards = -(normal[at] * x + normal[at + second] * y + normal[at + third] * z)
         facing = max(towards, zero) / np.sqrt(x * x + y * y + z * z)
-        inverse = one / max(z, f32(_NEAREST))
+        inverse = one / max(z, f32(_NEAREST_M))
         # To the nearest pixel; those outside end up in a frame around the image.
         u = min(max(x * inverse * image.focal_x + image.centre_x, -one), width)
         v = min(max(y * inverse * image.focal_y + image.centre_y, -one), height)
@@ -142,8 +142,8 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
         scores[k] = f32(-np.inf)
     stride = types * ways * size
     for type_id in range(num_types):
-        for way in range(0, ways, _AT_ONCE):
-            some = min(_AT_ONCE, ways - way)
+        for way in range(0, ways, _SKETCHES_AT_ONCE):
+            some = min(_SKETCHES_AT_ONCE, ways - way)
             first, full = (type_id * ways + way) * size, some * size
             for place in range(count):
                 _project(
@@ -171,7 +171,7 @@ def _sketch(frame):
     _score(
         floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), image, np.int64(sizes[2]),
         np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(types),
-        _new_points(_AT_ONCE * sizes[4]), float_results(frame, 0),
+        _new_points(_SKETCHES_AT_ONCE * sizes[4]), float_results(frame, 0),
     )  # fmt: skip
     return 0
 

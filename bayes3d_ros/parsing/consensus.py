@@ -4,10 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-MANY_OUTLIERS = 0.3  # share of the returns above which the search looks at consensus
-_REACH = 2  # pixels
-_WITHIN = 0.02  # of the depth: returns of one surface
-_FEWEST = 3  # returns that make a surface
+from bayes3d_ros.parsing.tuning import SEARCH
 
 
 def consensus(
@@ -16,21 +13,21 @@ def consensus(
     """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
     where fewer than three agree."""
     height, width = depth.shape
-    size = 2 * _REACH + 1
+    size = 2 * SEARCH.consensus_reach + 1
 
     def about(a: Array) -> Array:
-        padded = jnp.pad(a, _REACH)
+        padded = jnp.pad(a, SEARCH.consensus_reach)
         return jnp.stack([padded[v : v + height, u : u + width] for v in range(size) for u in range(size)])
 
     depths, classes = about(depth), about(pixel_class)
 
     def better(j: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
         chosen, most = best
-        agree = ((jnp.abs(depths - depths[j]) < _WITHIN * depths[j]) & (depths > 0)).sum(0)
+        agree = ((jnp.abs(depths - depths[j]) < SEARCH.consensus_within * depths[j]) & (depths > 0)).sum(0)
         return jnp.where(agree > most, j, chosen), jnp.maximum(agree, most)
 
     # The pixel's own return comes first: it stays where no other has more support.
     own = jnp.full(depth.shape, len(depths) // 2)
     chosen, most = jax.lax.fori_loop(0, len(depths), better, better(own[0, 0], (own, jnp.zeros_like(own))))
     depth, pixel_class = (jnp.take_along_axis(a, chosen[None], 0)[0] for a in (depths, classes))
-    return jnp.where(most >= _FEWEST, depth, 0.0), pixel_class
+    return jnp.where(most >= SEARCH.consensus_fewest, depth, 0.0), pixel_class

@@ -11,11 +11,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, shifted
 from bayes3d_ros.parsing.proposal import Modes, Proposal, propose
+from bayes3d_ros.parsing.tuning import SAMPLER
 from bayes3d_ros.sampling.metropolis import accept
 
 Tree = TypeVar("Tree", bound=Any)
-_STEPS = (0.05, 1.0)  # of a component's scale, a random walk's: the likelihood's peaks are of all widths
-_LOOSE = (0.004, 0.004, 0.05)  # metres, metres, radians: a walk's where no component is near
 
 
 def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
@@ -24,8 +23,8 @@ def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
     count = placement.type.shape[0]
     same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
     m = jax.random.categorical(choice, jnp.where(same, modes.log_weight, -jnp.inf))
-    scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(_LOOSE)))
-    low, high = jnp.log(jnp.array(_STEPS))
+    scale = jnp.where(same.any(1)[:, None, None], modes.scale[m], jnp.diag(jnp.array(SAMPLER.walk_scale)))
+    low, high = jnp.log(jnp.array(SAMPLER.walk_lengths))
     length = jnp.exp(low + (high - low) * jax.random.uniform(size, (count, 1)))
     step = length * jnp.einsum("nab,nb->na", scale, jax.random.normal(noise, (count, 3)))
     yaw = jnp.mod(placement.yaw + step[:, 2], 2 * jnp.pi)

@@ -11,20 +11,12 @@ from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, log_prior, shifted
 from bayes3d_ros.objects.self_symmetry import ALIKE
 from bayes3d_ros.parsing.proposal import Modes, draw_modes, log_density_modes, refit
+from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction
 from bayes3d_ros.sampling.tempering import tempered
 
 Tree = TypeVar("Tree")
-_DRAWS, _ROUNDS = 20, 4  # of `narrow`: draws a mode, rounds
-_PILOT_ROUNDS, PILOT_DRAWS, _PILOT_ESS = 4, 96, 0.2
-FINALISTS = 4
-COMPONENTS = FINALISTS * (1 + ALIKE)
-_INFLATION, _FLATTEN = 1.5, 4.0
-# In the pilots' word on masses, which rests on few of them: of the modes of a type, and of the types.
-_TRUST, _TRUST_TYPES = 0.5, 0.3
-_EACH = 0.4  # of the first pilots are shared alike among the modes: a fit may have missed a peak that draws find
-_PILOT_SCALE = 1.5  # pilots are drawn wider than the mixture: too narrow a component cannot see that it is
-_SMALLEST_SPREAD, _LARGEST_SPREAD = (2e-5, 2e-5, 2e-4), (0.05, 0.05, 2.0)  # metres, metres, radians
+COMPONENTS = SEARCH.finalists * (1 + ALIKE)
 
 
 class Hypotheses(NamedTuple):
@@ -53,15 +45,15 @@ def best_first(tree: Tree, score: Float[Array, "N"], count: int) -> tuple[Tree, 
 
 def factor(covariance: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     """Lower Cholesky factors of covariances in (x, y, yaw) that float32 may have made slightly indefinite."""
-    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), jnp.array(_SMALLEST_SPREAD) ** 2))
+    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance, axis1=1, axis2=2), jnp.array(SEARCH.smallest_spread) ** 2))
     correlation = covariance / (spread[:, :, None] * spread[:, None, :])
     return spread[:, :, None] * jnp.linalg.cholesky(correlation + 1e-5 * jnp.eye(3))
 
 
 def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     """Scales of a size that a mode may have: one that followed a ridge without end must not grow without end."""
-    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(_SMALLEST_SPREAD)), scale)
-    excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(_LARGEST_SPREAD)).max(1)
+    scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(SEARCH.smallest_spread)), scale)
+    excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(SEARCH.largest_spread)).max(1)
     return scale / jnp.maximum(excess, 1)[:, None, None]
 
 
@@ -88,7 +80,8 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         placement, scale = state
-        offset = jnp.einsum("mab,mdb->mda", scale, jax.random.normal(key, (*placement.type.shape, _DRAWS, 3)))
+        gauss = jax.random.normal(key, (*placement.type.shape, SEARCH.narrow_draws, 3))
+        offset = jnp.einsum("mab,mdb->mda", scale, gauss)
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
         value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
         value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
@@ -96,11 +89,11 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
         centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
         learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
-        floor = jnp.diag(jnp.array(_SMALLEST_SPREAD) ** 2)
+        floor = jnp.diag(jnp.array(SEARCH.smallest_spread) ** 2)
         covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
         return Hypotheses(_move(placement, best), factor(covariance)), value.max(1)
 
-    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, _ROUNDS))
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, SEARCH.narrow_rounds))
     return modes, values[-1]
 
 
@@ -151,13 +144,13 @@ def adapt(
     the sampler's own come after, so that nothing is chosen by its weight."""
 
     def pilot(key: PRNGKeyArray, modes: Modes) -> tuple[Modes, Pilots, Array]:
-        wide = modes._replace(scale=_PILOT_SCALE * modes.scale)
-        draws = draw_modes(key, wide, PILOT_DRAWS)
+        wide = modes._replace(scale=SEARCH.pilot_scale * modes.scale)
+        draws = draw_modes(key, wide, SEARCH.pilot_draws)
         log_target = gains(draws) + log_prior(draws, library, table)
         log_drawn = jax.nn.logsumexp(log_density_modes(draws, wide), 1)
         log_weight = log_target - log_drawn
         log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
-        weight = tempered(log_weight[None], _PILOT_ESS * PILOT_DRAWS)[0]
+        weight = tempered(log_weight[None], SEARCH.pilot_ess * SEARCH.pilot_draws)[0]
         # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
         component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)
         mass = jax.nn.logsumexp(component + log_weight[:, None], 0)
@@ -167,14 +160,14 @@ def adapt(
 
     def unfit(state: tuple) -> Array:
         trial, _, _, ess = state
-        return (trial < _PILOT_ROUNDS) & (ess < _PILOT_ESS)
+        return (trial < SEARCH.pilot_rounds) & (ess < SEARCH.pilot_ess)
 
     def again(state: tuple) -> tuple:
         trial, modes, _, _ = state
         return trial + 1, *pilot(jax.random.fold_in(key, trial), modes)
 
-    unknown = jnp.zeros(PILOT_DRAWS)
-    none_yet = Pilots(draw_modes(key, modes, PILOT_DRAWS), unknown, unknown)
+    unknown = jnp.zeros(SEARCH.pilot_draws)
+    none_yet = Pilots(draw_modes(key, modes, SEARCH.pilot_draws), unknown, unknown)
     _, modes, pilots, _ = jax.lax.while_loop(unfit, again, (0, modes, none_yet, jnp.float32(0.0)))
     return modes, pilots
 
@@ -188,7 +181,8 @@ def log_shares(mass: Float[Array, "M"], type_id: Int[Array, "M"]) -> Float[Array
     def of_type(value: Float[Array, "M"]) -> Float[Array, "M"]:
         return jax.nn.logsumexp(jnp.where(same, value, -jnp.inf), 1)
 
-    return jax.nn.log_softmax(_TRUST_TYPES * of_type(mass) + _TRUST * mass - of_type(_TRUST * mass))
+    trust, trust_types = SEARCH.trust_modes, SEARCH.trust_types
+    return jax.nn.log_softmax(trust_types * of_type(mass) + trust * mass - of_type(trust * mass))
 
 
 def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
@@ -213,7 +207,8 @@ def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Mo
 def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
     """A mixture of the modes, weighted by their log likelihoods and volumes. Flattened: the values are rough, and a
     mode that is missed costs more than one that is tried in vain."""
-    scale = _INFLATION**0.5 * modes.scale
+    scale = SEARCH.inflation**0.5 * modes.scale
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
-    log_weight = jax.nn.log_softmax((value + log_volume) / _FLATTEN)
-    return Modes(modes.placement, scale, jax.nn.log_softmax(jnp.logaddexp(log_weight, jnp.log(_EACH / len(value)))))
+    log_weight = jax.nn.log_softmax((value + log_volume) / SEARCH.flatten)
+    log_weight = jnp.logaddexp(log_weight, jnp.log(SEARCH.even_share / len(value)))
+    return Modes(modes.placement, scale, jax.nn.log_softmax(log_weight))

@@ -22,6 +22,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.model_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, draw_table_errors
@@ -30,8 +31,7 @@ from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import FEWEST_USABLE, ParseError, ScenePosterior, SceneSamples, usable_note
 from bayes3d_ros.settings import ParserSettings
 
-_NEGLIGIBLE = np.log(0.15)  # a number of objects this much less likely than the best ends the search for more
-_NO_SAMPLE = -30.0  # nats: samples of less weight are not kept
+_LEAST_LOG_WEIGHT = -30.0  # nats: samples of less weight are not kept
 
 
 class _Stage(NamedTuple):
@@ -192,11 +192,11 @@ class SceneParser:
             )
             ess.append(float(info.ess))
             log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
-            matters = log_mass[-2] > log_mass[-1] + _NO_SAMPLE
+            matters = log_mass[-2] > log_mass[-1] + _LEAST_LOG_WEIGHT
             if log_mass[-2] == max(log_mass):
                 before = self._refreshed(key, before, count, context, grid)
             stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, grid, matters))
-            if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + _NEGLIGIBLE):
+            if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + LEAST_LIKELY_COUNT):
                 break
         if log_mass[-1] == max(log_mass):
             state = self._refreshed(key, state, len(ess), context, grid)
@@ -261,7 +261,7 @@ class SceneParser:
         log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
         log_weight -= np.logaddexp.reduce(log_weight)
         n = np.repeat(counts, [len(s.log_weight) for s in stages])
-        keep = np.flatnonzero(log_weight > _NO_SAMPLE)
+        keep = np.flatnonzero(log_weight > _LEAST_LOG_WEIGHT)
         objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
         offset = np.concatenate([s.offset for s in stages])[keep]
         plane = np.concatenate([s.plane for s in stages])[keep]

@@ -12,12 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table
-from bayes3d_ros.parsing.coarse_search import CELL
+from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.sampling import student_t
-
-_DEGREES_OF_FREEDOM = 4.0
-# Shares of the proposal: the modes, where something could hide, anywhere. Without modes worth trying, all is floor.
-SHARES, SHARES_WITHOUT_MODES = (0.84, 0.12, 0.04), (0.0, 0.7, 0.3)
 
 
 class Modes(NamedTuple):
@@ -44,7 +40,7 @@ def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Placement:
     keys = jax.random.split(key, 3)
     m = jax.random.categorical(keys[0], modes.log_weight, shape=(count,))
     gauss = jax.random.normal(keys[1], (count, 3))
-    stretch = student_t.stretch(keys[2], count, _DEGREES_OF_FREEDOM)
+    stretch = student_t.stretch(keys[2], count, SEARCH.freedom)
     offset = jnp.einsum("nab,nb->na", modes.scale[m], gauss) * stretch
     centre = modes.centre
     return Placement(
@@ -64,8 +60,9 @@ def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryA
     face = jax.random.randint(keys[2], (count,), 0, NUM_FACES)
     yaw = jax.random.uniform(keys[3], (count,), maxval=2 * jnp.pi)
     cell = jax.random.categorical(keys[4], jnp.log(proposal.cells.ravel()), shape=(count,))
-    corner = jnp.stack([cell // proposal.cells.shape[1], cell % proposal.cells.shape[1]], -1) * CELL - table.size / 2
-    hidden = corner + CELL * jax.random.uniform(keys[5], (count, 2))
+    index = jnp.stack([cell // proposal.cells.shape[1], cell % proposal.cells.shape[1]], -1)
+    corner = index * SEARCH.cell - table.size / 2
+    hidden = corner + SEARCH.cell * jax.random.uniform(keys[5], (count, 2))
     anywhere = (jax.random.uniform(keys[6], (count, 2)) - 0.5) * (table.size - library.face_size[type_id, face])
     source = jax.random.choice(keys[7], 3, (count,), p=proposal.shares)
     floor = jnp.where((source == 1)[:, None], hidden, anywhere)
@@ -80,7 +77,7 @@ def log_density_modes(placement: Placement, modes: Modes) -> Float[Array, "N M"]
     log_determinant = jnp.log(jnp.abs(L[:, 0, 0] * L[:, 1, 1] * L[:, 2, 2]))
     # A wide component reaches around the circle.
     terms = [
-        student_t.log_density((whitened(placement, modes, turn) ** 2).sum(-1), 3, _DEGREES_OF_FREEDOM, log_determinant)
+        student_t.log_density((whitened(placement, modes, turn) ** 2).sum(-1), 3, SEARCH.freedom, log_determinant)
         for turn in (-2 * jnp.pi, 0.0, 2 * jnp.pi)
     ]
     return jnp.where(same, jax.nn.logsumexp(jnp.stack(terms), 0) + modes.log_weight, -jnp.inf)
@@ -98,7 +95,7 @@ def whitened(placement: Placement, modes: Modes, turn: float = 0.0) -> Float[Arr
 def refit(placement: Placement, weight: Float[Array, "N"], modes: Modes) -> Modes:
     """One step of population Monte Carlo (Cappe et al. 2008): weighted EM of the t mixture on draws from it. Components
     that hold too few draws keep their shape."""
-    nu = _DEGREES_OF_FREEDOM
+    nu = SEARCH.freedom
     share = jax.nn.softmax(log_density_modes(placement, modes), 1) * weight[:, None]
     held = share.sum(0)
     z = whitened(placement, modes)
@@ -121,12 +118,12 @@ def log_density(placement: Placement, proposal: Proposal, library: LibraryArrays
     """log q of proposed objects, per metre^2 and radian."""
     at_mode = log_density_modes(placement, proposal.modes)
     shape = jnp.array(proposal.cells.shape)
-    index = jnp.floor((jnp.stack([placement.x, placement.y], -1) + table.size / 2) / CELL).astype(jnp.int32)
+    index = jnp.floor((jnp.stack([placement.x, placement.y], -1) + table.size / 2) / SEARCH.cell).astype(jnp.int32)
     inside = ((index >= 0) & (index < shape)).all(-1)
     index = jnp.clip(index, 0, shape - 1)
     log_share = jnp.log(proposal.shares)
     log_discrete = -jnp.log(library.num_types * NUM_FACES * 2 * jnp.pi)
-    hidden = jnp.log(proposal.cells[index[:, 0], index[:, 1]]) - 2 * jnp.log(CELL)
+    hidden = jnp.log(proposal.cells[index[:, 0], index[:, 1]]) - 2 * jnp.log(SEARCH.cell)
     free = table.size - library.face_size[placement.type, placement.face]
     anywhere = (jnp.abs(jnp.stack([placement.x, placement.y], -1)) <= free / 2).all(-1)
     return jax.nn.logsumexp(

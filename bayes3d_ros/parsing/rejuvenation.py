@@ -23,11 +23,10 @@ from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.proposal import Proposal, log_density
 from bayes3d_ros.parsing.search import conflicts
+from bayes3d_ros.parsing.tuning import SAMPLER
 from bayes3d_ros.sampling.resampling import distinct_fraction, normalised, resample
 
-_COOLING = 0.7  # ratio of neighbouring exponents: about three quarters of the particles stay effective
-_MOVES = 3  # at b = 1, when all is done: one of each kind
-_APART = 60.0  # nats between objects' own gains, beyond which a move does not change which came last
+_ORDER_CLEAR_NATS = 60.0  # nats between objects' own gains, beyond which a move does not change which came last
 
 
 class WeightedScenes(NamedTuple):
@@ -96,7 +95,7 @@ def _move(
 
     without = _scenes_without(state, m, count, frame)
     gap = jnp.abs(state.solo_gain - jnp.take_along_axis(state.solo_gain, m[None, None], 1))
-    unclear = jnp.where(others & (jnp.arange(slots) < count), gap, jnp.inf).min() < _APART
+    unclear = jnp.where(others & (jnp.arange(slots) < count), gap, jnp.inf).min() < _ORDER_CLEAR_NATS
     # Behind the last slot: not among those that an object may conflict with.
     rest = jax.tree.map(lambda a: a.at[:, m].set(a[:, count - 1]), state.objects)
 
@@ -162,12 +161,14 @@ def _heat_and_cool(
 
     def step(number: Array, carry: tuple) -> tuple:
         placed, log_weight, b = carry
-        c = jnp.minimum(_COOLING ** jnp.minimum(number + 1, 2 * heats - number - 1).astype(jnp.float32), 1.0)
+        c = jnp.minimum(SAMPLER.cooling ** jnp.minimum(number + 1, 2 * heats - number - 1).astype(jnp.float32), 1.0)
         step = jnp.where(jnp.isfinite(placed.log_ratio), (c - b) * placed.log_ratio, -jnp.inf)
         log_weight, _ = normalised(log_weight + step)
         resample_key, move_key = jax.random.split(jax.random.fold_in(key, number))
         placed, log_weight = resample(resample_key, placed, log_weight, frame.ess_threshold)
         return move_new(move_key, placed, c, (number + 1) % 3, extend, proposal, library, table), log_weight, c
 
-    end, log_weight, _ = jax.lax.fori_loop(0, 2 * heats + _MOVES, step, (start, log_weight, jnp.float32(1.0)))
+    end, log_weight, _ = jax.lax.fori_loop(
+        0, 2 * heats + SAMPLER.moves_when_cold, step, (start, log_weight, jnp.float32(1.0))
+    )
     return end, log_weight

@@ -16,7 +16,6 @@ from bayes3d_ros.objects.library_arrays import NUM_FACES, SKETCH_POINTS, Library
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
-    YAWS,
     Evidence,
     cell_grid,
     cells_to_search,
@@ -24,11 +23,9 @@ from bayes3d_ros.parsing.coarse_search import (
     score_cells,
     sketch_score,
 )
-from bayes3d_ros.parsing.consensus import MANY_OUTLIERS, consensus
+from bayes3d_ros.parsing.consensus import consensus
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mode_search import (
-    FINALISTS,
-    PILOT_DRAWS,
     Hypotheses,
     Pilots,
     adapt,
@@ -40,21 +37,11 @@ from bayes3d_ros.parsing.mode_search import (
     take,
     with_lookalikes,
 )
-from bayes3d_ros.parsing.proposal import SHARES, SHARES_WITHOUT_MODES, Modes, Proposal, log_density, wrap
+from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, wrap
+from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.tempering import exponents
 
-_GLOBAL, _QUARTERS, _HALVES, _CANDIDATES = 48, 4, 2, 32
-_MODES = 8
-_FIT = (24, 5)  # draws a mode, rounds
-_LOOSE = (0.012, 0.012, 0.3)  # metres, metres, radians: how far off alignment may be where no surface holds it
-_ALIGNED = 0.015  # metres of residual that one sketch point is worth
-_BEHIND = 1e6  # nats
-_REPEATED = 4.0  # nats
-_WIDE = 120  # pixels across: the search sees smaller images whole, wider ones at half their resolution
-_BLUR = 0.002  # metres: candidates are scored at this sigma at least, or those a pixel beside the peak score as misses
-PLANNED_LEVELS = 6  # exponents of the path from the proposal to the target
-STEP_KEEPS = 0.33  # share of the effective draws that a step of the exponent keeps
-_WORTH = 5.0  # nats: below, no candidate is worth a search
+_CROWDED_OUT_NATS = 1e6  # more than any gain differs by: what is set back by so much comes last
 
 
 Gains = Callable[[Placement], Float[Array, "N"]]  # log likelihoods that objects [N] gain
@@ -73,7 +60,7 @@ def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: N
     """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
     explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
     an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
-    many = noise.p_outlier[0] > MANY_OUTLIERS
+    many = noise.p_outlier[0] > SEARCH.many_outliers
     depth, pixel_class = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
     if image.rows is not None:  # below the camera's last row the returns above it would agree on something
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
@@ -105,14 +92,14 @@ def _distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float,
 
 def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
     """Scores, with all but the `most` best of any place set behind the others, and those of a type there lowered by
-    `_REPEATED` for each that is better: what is seen best must crowd out neither what stands elsewhere nor another type
-    of a few percent. Sorted by falling score beforehand."""
+    `repeated_nats` for each that is better: what is seen best must crowd out neither what stands elsewhere nor another
+    type of a few percent. Sorted by falling score beforehand."""
     apart = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y)
     close = apart < library.radius[placement.type]
     before = jnp.tril(close & jnp.isfinite(score), -1)
     same = before & (placement.type[:, None] == placement.type)
-    score = score - _REPEATED * same.sum(1)
-    return jnp.where(before.sum(1) < most, score, score - _BEHIND)
+    score = score - SEARCH.repeated_nats * same.sum(1)
+    return jnp.where(before.sum(1) < most, score, score - _CROWDED_OUT_NATS)
 
 
 def candidates(
@@ -126,30 +113,30 @@ def candidates(
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
     # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
     # another.
-    _, index = jax.lax.top_k(scores.max(-1).ravel(), _GLOBAL)
-    half = YAWS // _HALVES
-    per_face = scores.reshape(-1, types, NUM_FACES, _HALVES, half).transpose(1, 2, 3, 0, 4)
-    per_face = per_face.reshape(types * NUM_FACES * _HALVES, -1)
+    _, index = jax.lax.top_k(scores.max(-1).ravel(), SEARCH.best_cells)
+    half = SEARCH.yaws // SEARCH.halves
+    per_face = scores.reshape(-1, types, NUM_FACES, SEARCH.halves, half).transpose(1, 2, 3, 0, 4)
+    per_face = per_face.reshape(types * NUM_FACES * SEARCH.halves, -1)
     cell, type_id, face = index // (types * NUM_FACES), index // NUM_FACES % types, index % NUM_FACES
-    quarter = jnp.argmax(scores[cell, type_id, face].reshape(_GLOBAL, _QUARTERS, -1), -1)
-    quarter = quarter + jnp.arange(_QUARTERS) * (YAWS // _QUARTERS)
+    quarter = jnp.argmax(scores[cell, type_id, face].reshape(SEARCH.best_cells, SEARCH.quarters, -1), -1)
+    quarter = quarter + jnp.arange(SEARCH.quarters) * (SEARCH.yaws // SEARCH.quarters)
     first = jnp.argmax(per_face, 1)
-    each_type, each_face, each_half = (a.ravel() for a in jnp.indices((types, NUM_FACES, _HALVES)))
+    each_type, each_face, each_half = (a.ravel() for a in jnp.indices((types, NUM_FACES, SEARCH.halves)))
     yaw = jnp.concatenate([quarter.ravel(), each_half * half + first % half])
-    cell = jnp.concatenate([jnp.repeat(cell, _QUARTERS), first // half])
-    type_id = jnp.concatenate([jnp.repeat(type_id, _QUARTERS), each_type])
-    face = jnp.concatenate([jnp.repeat(face, _QUARTERS), each_face])
+    cell = jnp.concatenate([jnp.repeat(cell, SEARCH.quarters), first // half])
+    type_id = jnp.concatenate([jnp.repeat(type_id, SEARCH.quarters), each_type])
+    face = jnp.concatenate([jnp.repeat(face, SEARCH.quarters), each_face])
     coarse = scores[cell, type_id, face, yaw]
-    placement = Placement(type_id, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / YAWS))
+    placement = Placement(type_id, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
     placement, information = align(placement, evidence, image, library, table)
-    loose = jnp.diag(1 / jnp.array(_LOOSE) ** 2)
-    found = Hypotheses(placement, factor(jnp.linalg.inv(information / _ALIGNED**2 + loose)))
+    loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
+    found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
     score = sketch_score(placement, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    return best_first(found, _distinct(found.placement, score, (0.008, 0.1)), _CANDIDATES)
+    return best_first(found, _distinct(found.placement, score, (0.008, 0.1)), SEARCH.candidates)
 
 
 def _gains(
@@ -182,28 +169,28 @@ def find_proposal(
     found, score = candidates(scene, evidence, context, shape, overlap_limit)
     rough = _rough_gains(depth, context, noise, window)
     found, best = _starts(found, score, rough, library)
-    worth = best > _WORTH
+    worth = best > SEARCH.worth_nats
     mixture, pilots = jax.lax.cond(
         worth,
         lambda: _searched(key, found, rough, scene, context, grid, window),
         lambda: _not_searched(found, library),
     )
     cells = hidden_cells(image, table, shape)
-    shares = jnp.where(worth, jnp.array(SHARES), jnp.array(SHARES_WITHOUT_MODES))
+    shares = jnp.where(worth, jnp.array(SEARCH.shares), jnp.array(SEARCH.shares_without_modes))
     proposal = Proposal(mixture, cells / cells.sum(), shares)
     log_q = log_density(pilots.placement, proposal, library, table)
     log_ratio = pilots.log_target - log_q
-    path = exponents(log_ratio, log_q - pilots.log_drawn, PLANNED_LEVELS, STEP_KEEPS)
-    return proposal, jnp.where(worth, path, jnp.ones(PLANNED_LEVELS))
+    path = exponents(log_ratio, log_q - pilots.log_drawn, SAMPLER.planned_levels, SAMPLER.step_keeps)
+    return proposal, jnp.where(worth, path, jnp.ones(SAMPLER.planned_levels))
 
 
 def _rough_gains(depth: Float[Array, "H W"], context: Context, noise: Noise, window: int) -> Gains:
-    """Gains over a scene at a noise that is no smaller than `_BLUR`, of a wide image at half its resolution."""
+    """Gains over a scene at a noise that is no smaller than `least_sigma`, of a wide image at half its resolution."""
     image, library, table = context
-    fewer = 2 if image.depth.shape[1] >= _WIDE else 1
+    fewer = 2 if image.depth.shape[1] >= SEARCH.halved_from else 1
     small = Context(halved(image) if fewer == 2 else image, library, table)
     small_depth = pad_scene(depth[::fewer, ::fewer], window)
-    blurred = noise._replace(sigma=jnp.maximum(noise.sigma, _BLUR))
+    blurred = noise._replace(sigma=jnp.maximum(noise.sigma, SEARCH.least_sigma))
 
     def rough(placement: Placement) -> Float[Array, "N"]:
         return fewer**2 * _gains(placement, small_depth, small, blurred, window)
@@ -215,10 +202,10 @@ def _starts(
     found: Hypotheses, score: Float[Array, "C"], rough: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, ""]]:
     """The hypotheses to follow uphill, and the gain of the best."""
-    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), _CANDIDATES)
+    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), SEARCH.candidates)
     best = gain[0]
-    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, _MODES * 3 // 4)
-    found, _ = best_first(found, gain, _MODES)
+    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, SEARCH.starts * 3 // 4)
+    found, _ = best_first(found, gain, SEARCH.starts)
     return found, best
 
 
@@ -235,9 +222,9 @@ def _searched(
     _, library, table = context
     narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
     modes, value = narrow(narrow_key, found, rough)
-    modes, value = best_first(modes, value, _MODES)
-    value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, FINALISTS - 1)
-    modes, _ = best_first(modes, value, FINALISTS)
+    modes, value = best_first(modes, value, SEARCH.starts)
+    value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, SEARCH.finalists - 1)
+    modes, _ = best_first(modes, value, SEARCH.finalists)
     grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
     noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
     rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
@@ -252,7 +239,7 @@ def _searched(
         gain = log_likelihood_gain(placement, ancestor, scene.depth[None], *context, near.coarse, window)
         return log_marginal(scene.loglik_grid[rows] + gain, near)
 
-    modes, value = sharpen(sharpen_key, modes, exact, *_FIT)
+    modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, SEARCH.fit_rounds)
     mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
     return with_lookalikes(mixture, exact, library), pilots
 
@@ -267,7 +254,7 @@ def _grid_with(
 
 def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:
     """A mixture and pilots of the same shapes, which nothing uses."""
-    modes = as_mixture(take(found, slice(FINALISTS)), jnp.zeros(FINALISTS))
+    modes = as_mixture(take(found, slice(SEARCH.finalists)), jnp.zeros(SEARCH.finalists))
     mixture = with_lookalikes(modes, lambda placement: jnp.zeros(placement.type.shape), library)
-    nobody = jax.tree.map(lambda a: jnp.zeros(PILOT_DRAWS, a.dtype), found.placement)
-    return mixture, Pilots(nobody, jnp.zeros(PILOT_DRAWS), jnp.zeros(PILOT_DRAWS))
+    nobody = jax.tree.map(lambda a: jnp.zeros(SEARCH.pilot_draws, a.dtype), found.placement)
+    return mixture, Pilots(nobody, jnp.zeros(SEARCH.pilot_draws), jnp.zeros(SEARCH.pilot_draws))

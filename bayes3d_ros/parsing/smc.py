@@ -30,16 +30,13 @@ from bayes3d_ros.parsing.coarse_search import cell_grid
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
-from bayes3d_ros.parsing.proposal import SHARES, Modes, Proposal, log_density, propose
+from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
-from bayes3d_ros.parsing.search import STEP_KEEPS, LeadScene, conflicts, find_proposal
+from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
+from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
 from bayes3d_ros.sampling.tempering import longest_step
-
-OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
-MOST_LEVELS = 16
-TOO_UNEVEN = 0.15  # effective fraction below which a planned step is shortened
-_MOVES = 2  # once resampled at the target; on the way there one
 
 
 class Population(NamedTuple):
@@ -92,7 +89,7 @@ def init(
                 jnp.full((max_objects, COMPONENTS), -jnp.log(COMPONENTS), jnp.float32),
             ),
             jnp.zeros((max_objects, *cell_grid(table_size))),
-            jnp.zeros((max_objects, len(SHARES))),
+            jnp.zeros((max_objects, len(SEARCH.shares))),
         ),
         empty=empty,
     )
@@ -188,15 +185,17 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
 
     def step(state: tuple) -> tuple:
         level, b, extended, log_weight, log_evidence, ess = state
-        c = jnp.where(level < MOST_LEVELS - 1, exponents[jnp.argmax(exponents > b)], 1.0)
+        c = jnp.where(level < SAMPLER.most_levels - 1, exponents[jnp.argmax(exponents > b)], 1.0)
         planned = effective_fraction(log_weight + (c - b) * extended.log_ratio)
-        shorter = longest_step(b, c, extended.log_ratio, log_weight, STEP_KEEPS)
-        c = jnp.where((planned < TOO_UNEVEN) & (level < MOST_LEVELS - 1), shorter, c)
+        shorter = longest_step(b, c, extended.log_ratio, log_weight, SAMPLER.step_keeps)
+        c = jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
         log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
         now = effective_fraction(log_weight)
         few = now < ess_threshold
         level_key = jax.random.fold_in(key, level)
-        extended, log_weight = resample(jax.random.fold_in(level_key, _MOVES), extended, log_weight, ess_threshold)
+        extended, log_weight = resample(
+            jax.random.fold_in(level_key, SAMPLER.moves_at_target), extended, log_weight, ess_threshold
+        )
 
         def move(number: Array, extended: Proposed) -> Proposed:
             move_key, choice = jax.random.fold_in(level_key, number), (level + number) % 3
@@ -205,7 +204,7 @@ def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_th
             begun = cast(Array, moved.lineage) + (level + 1) * len(fresh)
             return moved._replace(lineage=jnp.where(fresh, begun, cast(Array, extended.lineage)))
 
-        moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, _MOVES), 0)
+        moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, SAMPLER.moves_at_target), 0)
         extended = jax.lax.fori_loop(0, moves, move, extended)
         return level + 1, c, extended, log_weight, log_evidence + gained, jnp.minimum(ess, now)
 

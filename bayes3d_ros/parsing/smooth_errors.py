@@ -26,11 +26,13 @@ from bayes3d_ros.objects.placement import Placement, T_camera_object
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 
-_POINTS = 48  # of an object's sketch
-_BEHIND = 0.01  # metres behind what is seen in front, from which a point is hidden
-_HELD = 0.03  # share of the visible points by which outlines, which the field does not move, hold an object
-_ARM = 0.03  # metres, of the yaw that outlines hold
-_OUTLINE = 0.1  # scored pixels, how far off an outline may be that is seen all around; the less is seen, the farther
+# These change the posterior.
+_SAMPLES_AN_OBJECT = 48  # of an object's sketch
+_HIDDEN_BEHIND_M = 0.01  # metres behind what is seen in front, from which a point is hidden
+_OUTLINE_SHARE = 0.03  # share of the visible points by which outlines, which the field does not move, hold an object
+_OUTLINE_ARM_M = 0.03  # metres, of the yaw that outlines hold
+# Scored pixels, how far off an outline may be that is seen all around; the less is seen, the farther.
+_OUTLINE_OFF_PIXELS = 0.1
 _SMALLEST_SHARE = 0.05
 
 
@@ -50,24 +52,24 @@ def offset_covariance(
     half = window // 2
     type_id, face = jnp.maximum(objects.type, 0), jnp.maximum(objects.face, 0)
     T = T_camera_object(objects._replace(type=type_id, face=face), library, table)
-    points, normals = library.sketch[type_id][..., :_POINTS, :], library.sketch_normal[type_id][..., :_POINTS, :]
-    surface = in_camera(points, normals, T)
+    some = slice(_SAMPLES_AN_OBJECT)
+    surface = in_camera(library.sketch[type_id][..., some, :], library.sketch_normal[type_id][..., some, :], T)
     p, _ = surface
     _, u, v, inside = pixels_of(p, image)
     front = scenes[jnp.arange(len(scenes))[:, None, None], v + half, u + half]
     cosine = surface.cosine()
     facing = cosine > 0.1
-    seen = inside & facing & (p[..., 2] < front + _BEHIND) & (image.pixel_class[v, u] != NO_RETURN)
+    seen = inside & facing & (p[..., 2] < front + _HIDDEN_BEHIND_M) & (image.pixel_class[v, u] != NO_RETURN)
     J = normal_motion(surface, objects, table) * seen[..., None]
-    hold = _HELD * seen.sum(-1)[..., None, None] * jnp.diag(jnp.array([1.0, 1.0, _ARM**2]))
+    hold = _OUTLINE_SHARE * seen.sum(-1)[..., None, None] * jnp.diag(jnp.array([1.0, 1.0, _OUTLINE_ARM_M**2]))
     H = jnp.einsum("nmpa,nmpb->nmab", J, J) + hold + 1e-6 * jnp.eye(3)
     gain = jnp.linalg.solve(H, (J * cosine[..., None]).swapaxes(-1, -2))
     apart = ((p[..., :, None, :] - p[..., None, :, :]) ** 2).sum(-1)
     field = error.bias**2 + error.waviness**2 * jnp.exp(-0.5 * apart / error.length**2)
     smooth = jnp.einsum("nmap,nmpq,nmbq->nmab", gain, field, gain)
     share = seen.sum(-1) / jnp.maximum(facing.sum(-1), 1)
-    off = _OUTLINE * T[..., 2, 3] / image.focal[0] / jnp.maximum(share, _SMALLEST_SHARE)
-    outline = off[..., None, None] ** 2 * jnp.diag(jnp.array([1.0, 1.0, 1 / (2 * _ARM) ** 2]))
+    off = _OUTLINE_OFF_PIXELS * T[..., 2, 3] / image.focal[0] / jnp.maximum(share, _SMALLEST_SHARE)
+    outline = off[..., None, None] ** 2 * jnp.diag(jnp.array([1.0, 1.0, 1 / (2 * _OUTLINE_ARM_M) ** 2]))
     return smooth + jnp.where((error.bias > 0) | (error.waviness > 0), outline, 0.0)
 
 

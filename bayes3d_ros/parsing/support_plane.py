@@ -9,16 +9,17 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.parsing.model_constants import (
+    BELOW_TABLE,
+    EDGE_WIDTH,
+    PLANE_TOLERANCE,
+    SMALLEST_PIECE,
+    STANDING_SHARE,
+    SUPPORT_CELL,
+    SUPPORT_MARGIN,
+)
+from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.posterior.types import ParseError
-
-_INLIER = 0.008  # metres at 1 m, growing with depth squared beyond
-_TRIALS = 400
-_CELL = 0.02  # metres, of the map of the table's support
-_MARGIN = 0.0  # metres, about the hull
-_SMALLEST = 8  # pixels of a piece that counts as standing on the table
-_EDGE = 3  # pixels
-_STANDS = 0.6  # the share of a piece that must be over the table
-_BELOW = 0.02  # metres below the plane that still count as the table
 
 
 class Plane(NamedTuple):
@@ -29,7 +30,7 @@ class Plane(NamedTuple):
 
 
 def _tolerance(z: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    return _INLIER * np.maximum(z**2, 0.5)
+    return PLANE_TOLERANCE * np.maximum(z**2, 0.5)
 
 
 def find_plane(points: Float[np.ndarray, "N 3"], seed: int = 0) -> Plane:
@@ -43,7 +44,7 @@ def find_plane(points: Float[np.ndarray, "N 3"], seed: int = 0) -> Plane:
     rng = np.random.default_rng(seed)
     sample = points[rng.permutation(len(points))[:3000]].astype(np.float64)
     tolerance = _tolerance(sample[:, 2])
-    a, b, c = sample[rng.integers(len(sample), size=(3, _TRIALS))]
+    a, b, c = sample[rng.integers(len(sample), size=(3, SEARCH.plane_trials))]
     normal = np.cross(b - a, c - a)
     norm = np.linalg.norm(normal, axis=1)
     keep = norm > 1e-3
@@ -122,7 +123,7 @@ def workspace(
     local = (points - T_camera_table[:3, 3]) @ T_camera_table[:3, :3]
     z_camera = points[..., 2]
     with np.errstate(invalid="ignore"):
-        candidate = (local[..., 2] > -_BELOW * np.maximum(1, z_camera**2)) & (local[..., 2] < height)
+        candidate = (local[..., 2] > -BELOW_TABLE * np.maximum(1, z_camera**2)) & (local[..., 2] < height)
         candidate &= (np.abs(local[..., :2]) < np.array(table_size) / 2).all(-1)
         flat = candidate & (np.abs(local[..., 2]) < _tolerance(z_camera))
     # The foot of a wall or of an object lies in the plane too: keep what is flat all around.
@@ -138,10 +139,10 @@ def workspace(
     if count:
         share = ndimage.mean(over, pieces, np.arange(count + 1))
         size = np.bincount(pieces.ravel(), minlength=count + 1)
-        stands = (pieces > 0) & ((share > _STANDS) & (size >= _SMALLEST))[pieces]
+        stands = (pieces > 0) & ((share > STANDING_SHARE) & (size >= SMALLEST_PIECE))[pieces]
     # The foot of what stands beyond the table's edge is as flat as the table.
     other = np.isfinite(z_camera) & ~stands & ~(flat & over)
-    table = flat & over & ~ndimage.binary_dilation(other, iterations=_EDGE)
+    table = flat & over & ~ndimage.binary_dilation(other, iterations=EDGE_WIDTH)
     return np.where(stands | table, IN_WORKSPACE, np.where(other, BEYOND, NO_RETURN))
 
 
@@ -196,7 +197,7 @@ def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> 
     if len(surface) < 50:
         return None
     low = surface.min(0)
-    index = ((surface - low) / _CELL).astype(int)
+    index = ((surface - low) / SUPPORT_CELL).astype(int)
     counts = np.zeros(index.max(0) + 3, int)
     np.add.at(counts, tuple(index.T + 1), 1)
     # Objects cut the visible surface into pieces: bridge gaps of a hand's width.
@@ -206,7 +207,7 @@ def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> 
     sizes = ndimage.sum_labels(counts > 1, labels, np.arange(1, found + 1))
     piece = labels[tuple(index.T + 1)] == 1 + int(np.argmax(sizes))
     piece &= counts[tuple(index.T + 1)] > 1
-    ring = _MARGIN * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
+    ring = SUPPORT_MARGIN * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
     try:
         corners = surface[piece][ConvexHull(surface[piece]).vertices]
         return Delaunay(np.concatenate([(corners[:, None] + ring).reshape(-1, 2), eye[None]]))

@@ -14,6 +14,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.search import conflicts
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006
@@ -55,7 +56,7 @@ def gains(context, grid, board, empty):
     @jax.jit
     def of_block(placement):
         gain = log_likelihood_gain(placement, first, alone, *context, grid.coarse, WINDOW)
-        clash = conflicts(placement, others, jnp.int32(1), context.library, smc.OVERLAP_LIMIT)
+        clash = conflicts(placement, others, jnp.int32(1), context.library, OVERLAP_LIMIT)
         shown = render_objects(placement, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
         value = log_marginal(table + gain, grid) - log_marginal(table, grid)
         return jnp.where(clash, -jnp.inf, value), ~clash & (shown == alone).all((1, 2))

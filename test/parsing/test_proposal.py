@@ -11,8 +11,8 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table, log_prior
-from bayes3d_ros.parsing.coarse_search import CELL
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose, wrap
+from bayes3d_ros.parsing.tuning import SEARCH
 
 SIZE = (0.40, 0.36)  # of the table
 SHAPE = (20, 18)  # its cells
@@ -102,12 +102,12 @@ def test_floors(arrays, table):
     discrete = np.log(KINDS * FACES * 2 * np.pi)
     cells = np.asarray(proposal().cells)
     i, j = np.indices(SHAPE)
-    middle = (np.stack([i, j], -1) + 0.5) * CELL - np.array(SIZE) / 2
+    middle = (np.stack([i, j], -1) + 0.5) * SEARCH.cell - np.array(SIZE) / 2
     hidden = np.asarray(
         density(placements(1, 3, middle[..., 0], middle[..., 1], 1.0), proposal((0, 1, 0)), arrays, table)
     )
     with np.errstate(divide="ignore"):
-        np.testing.assert_allclose(hidden, (np.log(cells / CELL**2) - discrete).ravel(), atol=1e-4)
+        np.testing.assert_allclose(hidden, (np.log(cells / SEARCH.cell**2) - discrete).ravel(), atol=1e-4)
     rng = np.random.default_rng(0)
     n = 500
     at = placements(rng.integers(0, KINDS, n), rng.integers(0, FACES, n), *rng.uniform(-0.25, 0.25, (2, n)), 1.0)

@@ -11,6 +11,7 @@ from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likeliho
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006
@@ -151,7 +152,7 @@ def test_a_third_object_is_not_worth_its_room(scene, pair):
             assert np.isfinite(np.asarray(log_prior(mine, scene.arrays, scene.table))[some]).all()
             for other in range(m):
                 theirs = jax.tree.map(lambda a, m=other: a[:, m], state.objects)
-                assert (np.asarray(overlap(mine, theirs, scene.arrays))[some] <= smc.OVERLAP_LIMIT).all()
+                assert (np.asarray(overlap(mine, theirs, scene.arrays))[some] <= OVERLAP_LIMIT).all()
         # The tables that were summed gain by gain are those of the scenes drawn, up to one constant.
         whole = np.asarray(log_likelihood_scene(state.scenes[:8], context.image, grid.coarse, WINDOW))
         constant = whole - np.asarray(state.loglik_grid[:8])
