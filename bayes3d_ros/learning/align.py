@@ -13,16 +13,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.robust import geman_mcclure
+from bayes3d_ros.learning.model_constants import CORRELATED_POINTS, POINT_NOISE, POSE_PRIOR, RIM, SAME_SIDE
 from bayes3d_ros.learning.segment import Surface, middle
-
-_PRIOR = 0.015, 0.015, np.deg2rad(0.8)  # standard deviations of a pose's error at the object: metres, metres, radians
-_NOISE = 0.002  # metres, of a point against a surface of another view
-_CORRELATED = 5  # neighbouring points share their errors: so many count as one
-_REACH = (0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.02, 0.012, 0.012, 0.012, 0.008, 0.008, 0.008, 0.005, 0.005)  # m
-_SAME_SIDE = 0.6  # cosine between normals of partners: the two sides of a wall are none
-_RIM = 16, 0.4  # neighbours; share of their mean distance by which their middle is off at the rim of a surface
-_SPACING = 0.002  # metres between the points that others look for partners in
-_MOST = 700  # points of a view that look for partners
+from bayes3d_ros.learning.tuning import TUNING
 
 
 class Shift(NamedTuple):
@@ -57,16 +50,16 @@ def align_views(surfaces: list[Surface]) -> list[Shift]:
     about = np.mean([middle(surface.points) for surface in surfaces], 0)
     clouds = [_cloud(_thinned(surface)) for surface in surfaces]
     found = np.zeros((count, 3))
-    prior = np.tile(1 / np.square(_PRIOR), count)
-    for reach in _REACH if count > 1 else ():
+    prior = np.tile(1 / np.square(POSE_PRIOR), count)
+    for reach in TUNING.reaches if count > 1 else ():
         shifts = [_shift(values, about) for values in found]
         information, gradient = np.diag(prior), prior * found.ravel()
         for i in range(count):
             for j in range(count):
                 if i != j:
                     slope, residual = _between(clouds[i], clouds[j], shifts[i], shifts[j], reach)
-                    scale = max(reach / 3, _NOISE)
-                    weight = 1 / geman_mcclure(residual, scale) / (_CORRELATED * _NOISE**2)
+                    scale = max(reach / 3, POINT_NOISE)
+                    weight = 1 / geman_mcclure(residual, scale) / (CORRELATED_POINTS * POINT_NOISE**2)
                     columns = np.r_[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
                     information[np.ix_(columns, columns)] += (slope * weight[:, None]).T @ slope
                     gradient[columns] += slope.T @ (weight * residual)
@@ -90,7 +83,7 @@ def _between(
     near = np.flatnonzero(np.isfinite(distance))
     near = near[~other.rim[index[near]]]
     normal = other.surface.normals[index[near]] @ T_other[:3, :3].T
-    facing = np.einsum("ni,ni->n", normals[near] @ T[:3, :3].T, normal) > _SAME_SIDE
+    facing = np.einsum("ni,ni->n", normals[near] @ T[:3, :3].T, normal) > SAME_SIDE
     near, normal = near[facing], normal[facing]
     p = points[near] @ T[:3, :3].T + T[:3, 3]
     q = other.surface.points[index[near]] @ T_other[:3, :3].T + T_other[:3, 3]
@@ -108,17 +101,17 @@ def moved(surface: Surface, shift: Shift) -> Surface:
 
 
 def _cloud(surface: Surface) -> _Cloud:
-    some = np.linspace(0, len(surface.points) - 1, min(_MOST, len(surface.points))).astype(int)
+    some = np.linspace(0, len(surface.points) - 1, min(TUNING.partners, len(surface.points))).astype(int)
     tree = cKDTree(surface.points)
-    neighbours, share = _RIM
+    neighbours, share = RIM
     distance, index = tree.query(surface.points, min(neighbours, len(surface.points)), workers=-1)
     off = np.linalg.norm(surface.points[index].mean(1) - surface.points, axis=1)
     return _Cloud(surface, tree, off > share * distance.mean(1), some)
 
 
 def _thinned(surface: Surface) -> Surface:
-    """One point in each cube of `_SPACING`."""
-    cell = np.floor(surface.points / _SPACING).astype(int)
+    """One point in each cube of `TUNING.spacing`."""
+    cell = np.floor(surface.points / TUNING.spacing).astype(int)
     cell -= cell.min(0)
     _, first = np.unique(np.ravel_multi_index(tuple(cell.T), cell.max(0) + 1), return_index=True)
     return Surface(surface.points[first], surface.normals[first])

@@ -18,16 +18,9 @@ from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
+from bayes3d_ros.learning.model_constants import BEHIND_VOXEL, FEWEST_VOXELS, FOOT, GLIMPSE, HIT, LOW, PASS, THIN
 from bayes3d_ros.learning.segment import Surface
-
-# Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.
-_HIT, _PASS, _GLIMPSE = 2.5, 3.0, 1.0
-_BEHIND = 0.004  # metres, beside the voxel's own size, that a return lies behind a voxel that its ray passed
-_LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
-_FEWEST = 4  # voxels of a piece that is kept
-_MOST_VOXELS = 4_000_000
-_FOOT = 0.015  # metres: what is seen so low is taken to reach down to the table
-_THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)
+from bayes3d_ros.learning.tuning import TUNING
 
 
 class FusionGrid(NamedTuple):
@@ -75,7 +68,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
     passes, glimpses = rays.reshape(2, *grid.shape)
-    surface = _pieces((hits > 0) & (_HIT * hits - _GLIMPSE * glimpses - (_PASS - _GLIMPSE) * passes > 0))
+    surface = _pieces((hits > 0) & (HIT * hits - GLIMPSE * glimpses - (PASS - GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
     points, normals = (np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True))
@@ -110,7 +103,7 @@ def _grid(surfaces: Sequence[Surface], voxel_size: float) -> FusionGrid:
     low[:2], high = low[:2] - voxel_size, high + voxel_size
     low[2] = -voxel_size / 2
     shape = np.maximum(np.ceil((high - low) / voxel_size).astype(int), 1)
-    if shape.prod() > _MOST_VOXELS:
+    if shape.prod() > TUNING.most_voxels:
         size = " x ".join(f"{n}" for n in shape)
         raise FusionError(f"the object would fill a grid of {size} voxels: expected larger voxels than {voxel_size} m")
     return FusionGrid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
@@ -126,7 +119,7 @@ def _passed(
 ) -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "V"]]:
     """1 for voxels through all of which this view's rays go on to something behind them; and 1 for those through whose
     middle one does. The first is evidence against points seen in a voxel, the second enough where there are none."""
-    low = centres[:, 2] < _LOW
+    low = centres[:, 2] < LOW
     at = np.where(low[:, None], centres * [1, 1, 0], centres)  # of the lowest what counts is the table under them
     T = np.linalg.inv(T_table_camera)
     u, v, z, inside = nearest_pixels(at @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
@@ -136,8 +129,8 @@ def _passed(
     nearest = ndimage.minimum_filter(depth, 2 * int(np.ceil(width / 2)) + 1)
     around, middle = np.zeros(len(z)), np.zeros(len(z))
     around[inside], middle[inside] = nearest[v[inside], u[inside]], depth[v[inside], u[inside]]
-    all_through = around > z + np.where(low, -_BEHIND, np.sqrt(3) / 2 * voxel_size + _BEHIND)
-    through = middle > z + np.where(low, -_BEHIND, voxel_size / 2 + _BEHIND / 2)
+    all_through = around > z + np.where(low, -BEHIND_VOXEL, np.sqrt(3) / 2 * voxel_size + BEHIND_VOXEL)
+    through = middle > z + np.where(low, -BEHIND_VOXEL, voxel_size / 2 + BEHIND_VOXEL / 2)
     return all_through.astype(int), through.astype(int)
 
 
@@ -146,13 +139,13 @@ def _pieces(voxels: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     labels, count = ndimage.label(voxels, np.ones((3, 3, 3)))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
-    return (sizes >= min(_FEWEST, int(sizes.max(initial=0))))[labels] & voxels
+    return (sizes >= min(FEWEST_VOXELS, int(sizes.max(initial=0))))[labels] & voxels
 
 
 def _noise_of_a_neighbour(patches: Patches, grid: FusionGrid) -> Bool[np.ndarray, "S"]:
     """Voxels that hold only the tail of a surface next door: points of one surface scatter over two layers."""
     voxel, normal, offset = patches.voxel, patches.normal, patches.offset
-    times, near = _THIN
+    times, near = THIN
     row_of = np.full(np.array(grid.shape) + 2, -1)
     row_of[tuple(voxel.T + 1)] = np.arange(len(voxel))
     noise = np.zeros(len(voxel), bool)
@@ -171,7 +164,7 @@ def _noise_of_a_neighbour(patches: Patches, grid: FusionGrid) -> Bool[np.ndarray
 
 def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
     """Convex hull of the surface and of what it stands on."""
-    feet = points[points[:, 2] < points[:, 2].min() + _FOOT] * [1, 1, 0]
+    feet = points[points[:, 2] < points[:, 2].min() + FOOT] * [1, 1, 0]
     try:
         return ConvexHull(np.concatenate([points, feet]))
     except ValueError as error:  # QhullError is one

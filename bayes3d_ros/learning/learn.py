@@ -14,14 +14,13 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
+from bayes3d_ros.learning.model_constants import CONTRADICTED, SEEN_THROUGH
 from bayes3d_ros.learning.segment import Surface, Thing, View, ViewError, middle, segment, surface
 from bayes3d_ros.objects.mesh_import import contact_normals
 from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel
 from bayes3d_ros.settings import LearnerSettings
 
 MOST_VIEWS = 10
-_BEHIND = 0.015  # metres: a view that sees something so far behind a point sees through it
-_CONTRADICTED = 0.25  # share of a view's points that others see through, on average, from which it must go
 
 
 class LearningError(Exception):
@@ -176,7 +175,7 @@ def _worst(
         k: float(np.mean([_seen_through(aligned[k], frames[j], poses[j]) for j in aligned if j != k])) for k in aligned
     }
     wrong = max(through, key=lambda k: through[k])
-    if len(aligned) > 2 and through[wrong] > _CONTRADICTED:
+    if len(aligned) > 2 and through[wrong] > CONTRADICTED:
         return wrong, f"other views see through {through[wrong]:.0%} of its points: its camera pose must be wrong"
     return None, ""
 
@@ -186,7 +185,7 @@ def _seen_through(surface: Surface, frame: DepthFrame, T_table_camera: Float[np.
     T = np.linalg.inv(T_table_camera)
     u, v, z, inside = nearest_pixels(surface.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
     with np.errstate(invalid="ignore"):
-        return float((frame.depth[v[inside], u[inside]] > z[inside] + _BEHIND).sum() / len(z))
+        return float((frame.depth[v[inside], u[inside]] > z[inside] + SEEN_THROUGH).sum() / len(z))
 
 
 def _correction(frame: DepthFrame, pose: Float[np.ndarray, "4 4"], surface: Surface) -> tuple[float, float]:

@@ -8,19 +8,20 @@ from scipy import ndimage
 
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.learning.model_constants import (
+    EDGE_SHARE,
+    FEWEST_PIXELS,
+    FIRM,
+    FOOT_WITHIN,
+    LOWEST,
+    NORMAL_RADIUS,
+    SWELL,
+    TABLE_WITHIN,
+)
+from bayes3d_ros.learning.tuning import TUNING
 from bayes3d_ros.parsing.support_plane import Plane, find_plane
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import LearnerSettings
-
-_NEAR_TABLE = 0.05  # metres above and below the table that the pose promises, in which it is looked for
-_ENOUGH = 20_000  # points to find it by
-_LOWEST = 0.003, 0.010  # metres: the least and the largest height from which a return belongs to a thing
-_EDGE = 0.02  # share of the depth by which neighbours of a good pixel may differ
-_FEWEST = 60  # pixels that make a thing
-_SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises above it is a swell of the table
-_FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
-_STANDS = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
-_NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
 
 
 class ViewError(Exception):
@@ -64,22 +65,22 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
     local = points @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
     with np.errstate(invalid="ignore"):
         inside = _inside(local, settings) & (local[..., 2] < settings.workspace_height)
-        flat = inside & (np.abs(local[..., 2]) < _LOWEST[1])
+        flat = inside & (np.abs(local[..., 2]) < LOWEST[1])
     spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
-    lowest = float(np.clip(3 * spread, *_LOWEST))
+    lowest = float(np.clip(3 * spread, *LOWEST))
     risen = inside & (local[..., 2] > lowest) & _undisturbed(depth)
     firm = _firm(risen, np.isfinite(depth))
     labels = _things(local, risen, firm, settings.gap)
     sizes = np.bincount(labels[firm], minlength=labels.max() + 1)
-    above_swells = np.bincount(labels[firm & (local[..., 2] > _SWELL * lowest)], minlength=len(sizes))
+    above_swells = np.bincount(labels[firm & (local[..., 2] > SWELL * lowest)], minlength=len(sizes))
     foot = np.full(len(sizes), np.inf)
     np.minimum.at(foot, labels[risen], local[risen][:, 2])
-    stands = (sizes >= _FEWEST) & (above_swells >= _FEWEST / 4) & (foot < _STANDS)
+    stands = (sizes >= FEWEST_PIXELS) & (above_swells >= FEWEST_PIXELS / 4) & (foot < FOOT_WITHIN)
     found = [k for k in np.argsort(-sizes) if k > 0 and stands[k]]
     if not found:
         raise ViewError(
             f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
-            f"{1e3 * lowest:.0f} mm above it, expected at least {_FEWEST} together)"
+            f"{1e3 * lowest:.0f} mm above it, expected at least {FEWEST_PIXELS} together)"
         )
     pixels = [np.nonzero(labels == k) for k in found]
     return View(frame, T_table_camera, tuple(Thing(local[where], where) for where in pixels))
@@ -88,7 +89,7 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
 def surface(view: View, thing: Thing) -> Surface:
     """With normals of planes fitted to what the thing shows around each of its pixels."""
     distance = float(np.median(view.frame.depth[thing.pixels]))
-    side = 2 * int(np.clip(round(_NORMAL_RADIUS * view.frame.intrinsics.fx / distance), 2, 8)) + 1
+    side = 2 * int(np.clip(round(NORMAL_RADIUS * view.frame.intrinsics.fx / distance), 2, 8)) + 1
     rows, columns = thing.pixels
     at = rows - rows.min(), columns - columns.min()
     shape = at[0].max() + 1, at[1].max() + 1
@@ -129,12 +130,12 @@ def _on_its_table(
     rotation, position = T_table_camera[:3, :3], T_table_camera[:3, 3]
     local = points @ rotation.T + position
     with np.errstate(invalid="ignore"):
-        near = _inside(local, settings) & (np.abs(local[..., 2]) < _NEAR_TABLE)
+        near = _inside(local, settings) & (np.abs(local[..., 2]) < TABLE_WITHIN)
     try:
-        plane = find_plane(points[near][:: max(1, near.sum() // _ENOUGH)])
+        plane = find_plane(points[near][:: max(1, near.sum() // TUNING.table_points)])
     except ParseError:
         raise ViewError(
-            f"no table within {1e3 * _NEAR_TABLE:.0f} mm of where the camera pose puts it, inside the workspace"
+            f"no table within {1e3 * TABLE_WITHIN:.0f} mm of where the camera pose puts it, inside the workspace"
         ) from None
     normal = rotation @ plane.normal
     up = np.array([0.0, 0.0, 1.0])
@@ -178,14 +179,14 @@ def _undisturbed(depth: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     low, high = ndimage.minimum_filter(far, 3), ndimage.maximum_filter(near, 3)
     share = ndimage.uniform_filter(np.isfinite(depth).astype(np.float32), 3, mode="nearest")
     with np.errstate(invalid="ignore"):
-        return np.isfinite(depth) & (high - low < _EDGE * depth) & (share > 0.75)
+        return np.isfinite(depth) & (high - low < EDGE_SHARE * depth) & (share > 0.75)
 
 
 def _firm(risen: Bool[np.ndarray, "H W"], returned: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Risen pixels in the company of others. Of a large table thousands of returns lie beyond three standard deviations
     of its noise, most where its smooth part is high: each alone, but often within `gap` of the next."""
     count = ndimage.uniform_filter(returned.astype(np.float32), 3, mode="constant")
-    return risen & (ndimage.uniform_filter(risen.astype(np.float32), 3, mode="constant") > _FIRM * count)
+    return risen & (ndimage.uniform_filter(risen.astype(np.float32), 3, mode="constant") > FIRM * count)
 
 
 def _things(

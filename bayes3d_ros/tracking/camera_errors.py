@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bayes3d_ros.parsing.smooth_errors import SmoothError
+from bayes3d_ros.tracking.model_constants import HELD_SHARE
 
-_WAVES = 64
+_WAVES = 64  # that stand for the field; not recorded
 _FREQUENCIES = np.random.default_rng(0).normal(size=(_WAVES, 3)).astype(np.float32)
-_HELD = 1e-3  # of the mean square slope: a direction in which nothing moves stays where it is
-_BLOCKED = 1e-9
+_BLOCKED = 1e-9  # beside a sum of square slopes: no division by zero
 
 
 def pose_covariance(
@@ -25,7 +25,7 @@ def pose_covariance(
     """Covariance of a pose's tangent; `slope` is of rendered depth, zero where not seen, `points` in metres."""
     unit = jnp.sqrt((slope**2).sum((1, 2)) + _BLOCKED)  # metres and radians: ones on the diagonal
     J = slope / unit[:, None, None]
-    square = jnp.einsum("ahw,bhw->ab", J, J, precision="highest") + _HELD * jnp.eye(6)
+    square = jnp.einsum("ahw,bhw->ab", J, J, precision="highest") + HELD_SHARE * jnp.eye(6)
     phase = jnp.einsum("hwa,ka->khw", points, jnp.asarray(_FREQUENCIES) / error.length)
     waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)]) * (error.waviness / jnp.sqrt(_WAVES))
     fields = jnp.concatenate([waves, jnp.full((1, *seen.shape), error.bias)]) * seen

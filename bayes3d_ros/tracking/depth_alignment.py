@@ -14,8 +14,9 @@ from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
-_DELTA = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)  # metres and radians
-RENDERED = 1 + 2 * len(_DELTA)  # images that a step looks at
+# Metres and radians: differences of rendered depth over them are slopes.
+_SLOPE_STEPS = (5e-4, 5e-4, 5e-4, 2e-3, 2e-3, 2e-3)
+RENDERED = 1 + 2 * len(_SLOPE_STEPS)  # images that a step looks at
 
 
 class TrackedScene(NamedTuple):
@@ -65,7 +66,7 @@ def rendered_slopes(
 ) -> tuple[Float[Array, "H W"], Float[Array, "6 H W"], Bool[Array, "H W"]]:
     """Rendered depth at a tangent that `pose` makes a camera pose of, its slopes along the tangent, and where there
     are both and a return; zero elsewhere."""
-    delta = jnp.array(_DELTA)
+    delta = jnp.array(_SLOPE_STEPS)
     around = jnp.concatenate([jnp.zeros((1, 6)), jnp.diag(delta), -jnp.diag(delta)])
     depth = render_cameras(pose(at + around), scene.world, image, scene.library)
     seen = (image.pixel_class == IN_WORKSPACE) & jnp.isfinite(depth).all(0)

@@ -7,7 +7,7 @@ frame the likelihood is searched coarse to fine for a mixture q; draws from it h
     p(image | T) sum_j w_j p(T | particle j) / q(T),
 
 the predictive of a whole population, not of one ancestor (the marginal particle filter, Klaas et al. 2005), so that
-the search may go where the image says and the weights stay proper. The population is one of `_ANCESTORS` resampled
+the search may go where the image says and the weights stay proper. The population is one of `ancestors` resampled
 particles: the sum is over every pair, and half a million of them would cost more than the images. Densities are over
 SE(3)'s invariant measure.
 """
@@ -33,21 +33,8 @@ from bayes3d_ros.sampling import student_t
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, systematic
 from bayes3d_ros.sampling.tempering import tempered
 from bayes3d_ros.tracking.depth_alignment import RENDERED, TrackedScene, aligned, information, rendered_slopes
-
-_FREEDOM = 5.0  # degrees of freedom, of the motion's and the proposal's t distributions
-_BLURS = (0.012, 0.003, 0.001, 0.0, 0.0)  # metres of sigma at least, round by round: before alignment, and after
-_ROUND_SHARE = 0.1  # of the hypotheses, each round
-_STARTS = 2  # of alignment
-_LEAST_OUTLIERS = 0.02  # p_outlier while searching: with less, one bad pixel decides
-_REACH = (0.03, 0.015, 0.006, 0.003, 0.0015, 0.0008)  # metres: residuals beyond count little, step by step,
-_LEAST_REACH = (4.0, 0.003)  # but none so small, in sigmas and at most in metres
-_KEEP = 0.1  # share of a round's draws that stay effective when they are weighed
-_WIDEN = 1.2  # of the scale learned from a round, for the next
-_ANCESTORS = 32  # of the particles, that draws may have moved from
-_NOISE_LEVELS = 3  # coarse sigmas that draws are scored at: of pixels there are enough to tell sigma to a tenth
-_ALIGNED = 34  # pixels across, at most, of the images that alignment looks at: with more it is surer than voxels allow
-_FROM_MOTION = 0.1  # share of the filter's draws that come from the predictive
-_SMALLEST = (1e-5, 1e-5, 1e-5, 2e-5, 2e-5, 2e-5)  # metres and radians: no proposal is narrower
+from bayes3d_ros.tracking.model_constants import MOTION_FREEDOM
+from bayes3d_ros.tracking.tuning import FILTER
 
 
 class Motion(NamedTuple):
@@ -117,10 +104,15 @@ def log_predictive(
     """log of w_j p(T | particle j), where each particle's velocity leads to `expected`."""
     change = log_about(product(T[:, None], inverse(expected)), jnp.zeros(3))
     scale = _scales(motion)
-    log_p = (
-        student_t.log_density(((change / scale) ** 2).sum(-1), 6, _FREEDOM) - jnp.log(scale).sum() - log_volume(change)
-    )
+    log_standard = student_t.log_density(((change / scale) ** 2).sum(-1), 6, MOTION_FREEDOM)
+    log_p = log_standard - jnp.log(scale).sum() - log_volume(change)
     return log_p + log_weight
+
+
+def _predicted(key: PRNGKeyArray, expected: Float[Array, "D 4 4"], motion: Motion) -> Float[Array, "D 4 4"]:
+    """A draw of the motion from each of the poses that velocities lead to."""
+    change = student_t.draw_standard(key, len(expected), 6, MOTION_FREEDOM) * _scales(motion)
+    return product(exp_about(change, jnp.zeros(3)), expected)
 
 
 class _Chart(NamedTuple):
@@ -142,16 +134,16 @@ class _Chart(NamedTuple):
         # Solved for six columns and not for one a draw: JAX's triangular solve is slow on CPUs.
         inverse_scale = jax.scipy.linalg.solve_triangular(self.scale, jnp.eye(6), lower=True)
         z = jnp.einsum("da,ba->db", tangent - self.mean, inverse_scale, precision=jax.lax.Precision.HIGHEST)
-        log_standard = student_t.log_density((z**2).sum(-1), 6, _FREEDOM)
+        log_standard = student_t.log_density((z**2).sum(-1), 6, FILTER.freedom)
         return log_standard - jnp.log(jnp.diag(self.scale)).sum() - log_volume(tangent)
 
 
 def _learned(chart: _Chart, tangent: Float[Array, "D 6"], value: Float[Array, "D"]) -> _Chart:
     """The t distribution moved to where draws [D] have high log likelihoods, tempered so that enough of them count."""
     value = jnp.maximum(value - value.max(), -1e6)
-    weight = tempered(value, _KEEP * len(value))
+    weight = tempered(value, FILTER.keep * len(value))
     mean = weight @ tangent
-    unit = jnp.array(_SMALLEST)
+    unit = jnp.array(FILTER.narrowest)
     centred = (tangent - mean) / unit
     square = jnp.einsum("d,da,db->ab", weight, centred, centred, precision=jax.lax.Precision.HIGHEST) + jnp.eye(6)
     old = chart.scale / unit[:, None]
@@ -176,7 +168,7 @@ def step(
     if len(state.log_weight) != own:
         raise ValueError(f"expected {own} particles of {hypotheses} hypotheses, got {len(state.log_weight)}")
     search_key, draw_key, ancestor_key, kept_key = jax.random.split(key, 4)
-    kept = systematic(kept_key, state.log_weight, min(_ANCESTORS, own))
+    kept = systematic(kept_key, state.log_weight, min(FILTER.ancestors, own))
     before, motions = state.T_camera_world[kept], state.motion[kept]
     log_share = jnp.full(len(kept), -jnp.log(len(kept)))
     expected = product(motions, before)
@@ -191,11 +183,11 @@ def step(
     by_ancestor = over_devices(log_predictive, devices)(T, expected, log_share, motion)
     log_prior = jax.nn.logsumexp(by_ancestor, 1)
     log_q = jnp.logaddexp(
-        jnp.log1p(-_FROM_MOTION) + chart.log_density(T),
-        jnp.log(_FROM_MOTION) + log_prior,
+        jnp.log1p(-FILTER.from_motion) + chart.log_density(T),
+        jnp.log(FILTER.from_motion) + log_prior,
     )
     # Noise about the best for the pose that the search ended at: no draw has a say in it, and the rest has no mass.
-    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, _NOISE_LEVELS)
+    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, FILTER.noise_levels)
     loglik_grid = score(T, near.coarse)
     log_likelihood = noise_model.log_marginal(loglik_grid, near)
     log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
@@ -208,7 +200,7 @@ def step(
     return new, FilterInfo(
         mean,
         covariance,
-        _FREEDOM / (_FREEDOM - 2) * product(chart.scale, chart.scale.T),
+        FILTER.freedom / (FILTER.freedom - 2) * product(chart.scale, chart.scale.T),
         log_evidence - jnp.log(own),
         effective_fraction(log_weight),
         noise.sigma[0],
@@ -219,10 +211,11 @@ def step(
 def shares(hypotheses: int) -> tuple[int, int]:
     """Of the hypotheses of a frame: those of a round of the search, and the filter's own draws, its particles. The rest
     serves alignment. Raises ValueError for too few."""
-    each, aligning = int(_ROUND_SHARE * hypotheses), _STARTS * (1 + RENDERED * (1 + len(_REACH)))
-    own = hypotheses - len(_BLURS) * each - aligning
+    each, aligning = int(FILTER.round_share * hypotheses), FILTER.starts * (1 + RENDERED * (1 + len(FILTER.reaches)))
+    own = hypotheses - len(FILTER.blurs) * each - aligning
     if own < each:
-        least = ceil(aligning / (1 - (1 + len(_BLURS)) * _ROUND_SHARE) - 1e-9)  # 460, not 460 and a rounding error
+        own_least = 1 - (1 + len(FILTER.blurs)) * FILTER.round_share
+        least = ceil(aligning / own_least - 1e-9)  # 460, not 460 and a rounding error
         raise ValueError(f"expected at least {least} hypotheses, got {hypotheses}")
     return each, own
 
@@ -240,26 +233,23 @@ def _search(
     image, the best of those narrowed round by round."""
     image, scene, _, motion = observed
     each, _ = shares(hypotheses)
-    p_outlier = jnp.maximum(state.p_outlier, _LEAST_OUTLIERS)[None]
-    blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in _BLURS]
+    p_outlier = jnp.maximum(state.p_outlier, FILTER.least_outliers)[None]
+    blurs = [Noise(jnp.maximum(state.sigma, blur)[None], p_outlier) for blur in FILTER.blurs]
     best = expected_pose(state)
     scale = _scales(motion)
     chart = _Chart(best, scene.pivot_seen(best), jnp.zeros(6), jnp.diag(scale))
     draw_key, pick_key = jax.random.split(jax.random.fold_in(key, 0))
     index = jax.random.randint(pick_key, (each,), 0, len(expected))
-    tried = (
-        product(exp_about(student_t.draw_standard(draw_key, each, 6, _FREEDOM) * scale, jnp.zeros(3)), expected[index])
-        .at[0]
-        .set(best)
-    )
-    _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], _STARTS)
-    coarse = at_most(image, _ALIGNED)
+    tried = _predicted(draw_key, expected[index], motion).at[0].set(best)
+    _, starts = jax.lax.top_k(score(tried, blurs[0])[:, 0, 0], FILTER.starts)
+    coarse = at_most(image, FILTER.aligned_width)
     align = over_devices(_all_aligned, devices)
     means, scales = align(chart.tangent(tried[starts]), chart, coarse, scene, scale, state.sigma)
     pick = jnp.argmax(score(chart.pose(means), blurs[1])[:, 0, 0])
     chart = chart._replace(mean=means[pick], scale=scales[pick])
     for number, noise in enumerate(blurs[1:], 1):
-        step = _WIDEN * student_t.draw_standard(jax.random.fold_in(key, number), each, 6, _FREEDOM) @ chart.scale.T
+        standard = student_t.draw_standard(jax.random.fold_in(key, number), each, 6, FILTER.freedom)
+        step = FILTER.widen * standard @ chart.scale.T
         tangent = (chart.mean + step).at[0].set(chart.mean)
         chart = _learned(chart, tangent, score(chart.pose(tangent), noise)[:, 0, 0])
     return chart
@@ -285,8 +275,8 @@ def _aligned(
     sigma: Float[Array, ""],
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """Where alignment ends, and the scale of the errors left if they are independent and as large as sigma."""
-    least = jnp.minimum(_LEAST_REACH[0] * sigma, _LEAST_REACH[1])
-    mean = aligned(chart.pose, start, image, scene, scale, jnp.maximum(jnp.array(_REACH), least))
+    least = jnp.minimum(FILTER.least_reach[0] * sigma, FILTER.least_reach[1])
+    mean = aligned(chart.pose, start, image, scene, scale, jnp.maximum(jnp.array(FILTER.reaches), least))
     _, slope, seen = rendered_slopes(chart.pose, mean, image, scene)
     # With ones on the diagonal: metres and radians, and a prior a thousand times wider, are too much for float32.
     precision = information(slope, jnp.where(seen, 1 / sigma**2, 0.0)) + jnp.diag(1 / scale**2)
@@ -304,12 +294,10 @@ def _propose(
 ) -> Float[Array, "D 4 4"]:
     """Draws from the mixture of what the search learned and the predictive of equally likely ancestors."""
     keys = jax.random.split(key, 4)
-    searched = chart.pose(chart.mean + student_t.draw_standard(keys[0], count, 6, _FREEDOM) @ chart.scale.T)
+    searched = chart.pose(chart.mean + student_t.draw_standard(keys[0], count, 6, FILTER.freedom) @ chart.scale.T)
     index: Int[Array, "D"] = jax.random.randint(keys[1], (count,), 0, len(expected))
-    predicted = product(
-        exp_about(student_t.draw_standard(keys[2], count, 6, _FREEDOM) * _scales(motion), jnp.zeros(3)), expected[index]
-    )
-    from_motion = jax.random.uniform(keys[3], (count,)) < _FROM_MOTION
+    predicted = _predicted(keys[2], expected[index], motion)
+    from_motion = jax.random.uniform(keys[3], (count,)) < FILTER.from_motion
     return jnp.where(from_motion[:, None, None], predicted, searched)
 
 

@@ -25,17 +25,9 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage, at_most
 from bayes3d_ros.likelihood.sharding import over_devices
 from bayes3d_ros.parsing.support_plane import find_plane, table_frame
 from bayes3d_ros.tracking.depth_alignment import TrackedScene, aligned
+from bayes3d_ros.tracking.tuning import RELOCALISE
 
-_DRAWS = 8192
-_ALIGNED = 96  # of them
-_APART = (0.1, 0.3)  # share of the distance, and radians: two that are nearer in both count as one
-_REACHES = (0.05, 0.05, 0.05, 0.03, 0.03, 0.02, 0.015, 0.01, 0.006)  # metres, of alignment
-_SCALE = (0.1, 0.1, 0.1, 0.3, 0.3, 0.3)  # metres and radians that it may move a camera
-_BESIDE = 0.25  # metres that the target may be beside the optical axis, over a table
-_LEVEL = 0.05  # sine of the angle below which a camera looks along the table, not at it
-_ROUGH, _FINE, _P_OUTLIER = 0.02, 0.006, 0.1  # metres of sigma, before and after
-_AT_A_TIME = 64  # cameras that somebody suggests
-_WIDEST = 64  # pixels across, at most, of the image that is looked at
+_CAMERAS_AT_A_TIME = 64  # of those that somebody suggests: one compilation for any number
 
 
 class LookAt(NamedTuple):
@@ -73,11 +65,12 @@ def over_table(
     high as the target (or, where it never is, near the table's origin)."""
     T_table_camera = np.linalg.inv(T_camera_table)
     eye, axis = T_table_camera[:3, 3], T_table_camera[:3, 2]
-    seen = eye + axis * (target[2] - eye[2]) / axis[2] if axis[2] < -_LEVEL else np.zeros(3)
+    seen = eye + axis * (target[2] - eye[2]) / axis[2] if axis[2] < -RELOCALISE.level else np.zeros(3)
     u = qmc.Sobol(3, seed=rng).random(count)
     T_world_table = np.tile(np.eye(4), (count, 1, 1))
     T_world_table[:, :3, :3] = Rotation.from_rotvec(np.outer(2 * np.pi * u[:, 0], [0, 0, 1])).as_matrix()
-    T_world_table[:, :2, 3] = target[:2] + _BESIDE * (2 * u[:, 1:] - 1) - (T_world_table[:, :3, :3] @ seen)[:, :2]
+    beside = RELOCALISE.beside * (2 * u[:, 1:] - 1)
+    T_world_table[:, :2, 3] = target[:2] + beside - (T_world_table[:, :3, :3] @ seen)[:, :2]
     return T_world_table @ T_table_camera
 
 
@@ -92,17 +85,17 @@ def find_camera(
 ) -> Float[np.ndarray, "4 4"]:
     """The likeliest T_world_camera that is found; `points` are the frame's returns. Raises ParseError where a table
     that the world has is not seen."""
-    image = at_most(image, _WIDEST)
+    image = at_most(image, RELOCALISE.widest)
     target = np.asarray(scene.pivot, np.float64)
     if scene.world.table_visible:
-        T_world_camera = over_table(table_frame(find_plane(points), points), _DRAWS, target, rng)
+        T_world_camera = over_table(table_frame(find_plane(points), points), RELOCALISE.draws, target, rng)
     else:
-        T_world_camera = prior.draw(_DRAWS, target, points.mean(0), rng)
+        T_world_camera = prior.draw(RELOCALISE.draws, target, points.mean(0), rng)
     T_camera_world = jnp.asarray(np.linalg.inv(T_world_camera), jnp.float32)
-    value = np.asarray(_scores(T_camera_world, image, scene, _ROUGH, window, devices))
-    best = _best_apart(value, T_world_camera, target, _ALIGNED)
+    value = np.asarray(_scores(T_camera_world, image, scene, RELOCALISE.rough_sigma, window, devices))
+    best = _best_apart(value, T_world_camera, target, RELOCALISE.aligned)
     moved = _all_aligned(T_camera_world[best], image, scene, devices)
-    value = np.asarray(_scores(moved, image, scene, _FINE, window, devices))
+    value = np.asarray(_scores(moved, image, scene, RELOCALISE.fine_sigma, window, devices))
     return np.linalg.inv(np.asarray(moved[value.argmax()], np.float64))
 
 
@@ -115,10 +108,10 @@ def likeliest(
 ) -> Float[np.ndarray, "4 4"]:
     """The first of the likeliest of any number of cameras: scored so many at a time that nothing is compiled anew."""
     T_camera_world, value = np.linalg.inv(T_world_camera), []
-    for first in range(0, len(T_camera_world), _AT_A_TIME):
-        some = T_camera_world[first : first + _AT_A_TIME]
-        padded = jnp.asarray(np.resize(some, (_AT_A_TIME, 4, 4)), jnp.float32)
-        value.append(np.asarray(_scores(padded, image, scene, _FINE, window, devices))[: len(some)])
+    for first in range(0, len(T_camera_world), _CAMERAS_AT_A_TIME):
+        some = T_camera_world[first : first + _CAMERAS_AT_A_TIME]
+        padded = jnp.asarray(np.resize(some, (_CAMERAS_AT_A_TIME, 4, 4)), jnp.float32)
+        value.append(np.asarray(_scores(padded, image, scene, RELOCALISE.fine_sigma, window, devices))[: len(some)])
     return T_world_camera[np.concatenate(value).argmax()]
 
 
@@ -131,7 +124,7 @@ def _scores(
     window: int,
     devices: tuple[jax.Device, ...],
 ) -> Float[Array, "N"]:
-    noise = Noise(jnp.float32([sigma]), jnp.float32([_P_OUTLIER]))
+    noise = Noise(jnp.float32([sigma]), jnp.float32([RELOCALISE.p_outlier]))
     score = over_devices(partial(log_likelihood_of_cameras, window=window), devices)
     return score(T_camera_world, scene.world, image, scene.library, noise)[:, 0, 0]
 
@@ -152,7 +145,7 @@ def _aligned(T_camera_world: Float[Array, "4 4"], image: ScoredImage, scene: Tra
     def pose(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
         return product(exp_about(tangent, centre), T_camera_world)
 
-    return pose(aligned(pose, jnp.zeros(6), image, scene, jnp.array(_SCALE), jnp.array(_REACHES)))
+    return pose(aligned(pose, jnp.zeros(6), image, scene, jnp.array(RELOCALISE.scale), jnp.array(RELOCALISE.reaches)))
 
 
 def _best_apart(
@@ -163,8 +156,9 @@ def _best_apart(
 ) -> Int[np.ndarray, "count"]:
     """The best, from the best on, that are not nearly one of these; the same again where there are too few."""
     place, turn = T_world_camera[:, :3, 3], T_world_camera[:, :3, :3]
-    reach = _APART[0] * np.linalg.norm(place - target, axis=1)
-    alike = 2 * np.sqrt(2) * np.sin(_APART[1] / 2)  # the distance between two rotations, as matrices, at that angle
+    reach = RELOCALISE.apart[0] * np.linalg.norm(place - target, axis=1)
+    # The distance between two rotations, as matrices, at that angle.
+    alike = 2 * np.sqrt(2) * np.sin(RELOCALISE.apart[1] / 2)
     kept: list[int] = []
     for k in np.argsort(-value):
         near = np.linalg.norm(place[k] - place[kept], axis=1) < reach[kept]

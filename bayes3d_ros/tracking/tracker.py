@@ -29,17 +29,17 @@ from bayes3d_ros.tracking import marginal_filter
 from bayes3d_ros.tracking.camera_errors import pose_covariance
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.depth_alignment import TrackedScene, rendered_slopes
+from bayes3d_ros.tracking.model_constants import (
+    EXPLAINED,
+    NEAR_OBJECT,
+    NEAR_TABLE_PLANE,
+    OUT_OF_SIGHT,
+    OUTLINE_ARM,
+    OUTLINE_OFF_PIXELS,
+    STEEP,
+)
 from bayes3d_ros.tracking.relocalise import LookAt, find_camera, likeliest
-
-_NEAR_TABLE = (0.02, 0.02)  # metres, and share of the depth, off its plane within which a return may be the table's
-_NEAR_OBJECT = 0.08  # metres from an object's sphere in which a return may still be its own
-_OUT_OF_SIGHT = 12  # pixels: with fewer there is nothing to follow
-_EXPLAINED = (0.006, 0.01)  # metres, and share of the depth, within which a return lies where the world puts it
-_STEEP = 5.0  # slope of depth against a shift, from which it is an outline's and no surface's
-_OUTLINE = 0.1  # scored pixels, how far off outlines are (as in `smooth_errors.py`)
-_ARM = 0.03  # metres, that they hold a turn by at least
-_FINE = (6, 4)  # noise between coarse points: images this small tell it to a few percent at best
-_PLANE_WIDTH = 160  # pixels across, of the image that the table is found in
+from bayes3d_ros.tracking.tuning import FILTER, RELOCALISE
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class CameraTracker:
         self._devices = tuple(jax.devices())
         # What every frame needs lies on every device once, and is not carried there again and again.
         self._arrays = on_all(library_arrays(library), self._devices)
-        self._grid = on_all(noise_grid(settings.sigma_max, _FINE), self._devices)
+        self._grid = on_all(noise_grid(settings.sigma_max, FILTER.noise_between), self._devices)
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
         self._error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
         self._smooth = jax.jit(_smooth_covariance)
@@ -153,7 +153,7 @@ class CameraTracker:
         return now, replace(estimate, lost=self._why_lost(estimate))
 
     def _why_lost(self, estimate: CameraEstimate) -> str:
-        if estimate.in_sight < _OUT_OF_SIGHT:
+        if estimate.in_sight < OUT_OF_SIGHT:
             return f"the world's objects are out of sight ({estimate.in_sight} pixels)"
         if estimate.explained < self.settings.least_explained:
             return f"only {estimate.explained:.0%} of the objects' {estimate.in_sight} pixels are where they should be"
@@ -180,7 +180,7 @@ class CameraTracker:
             settings.nearest_camera, settings.farthest_camera, settings.lowest_camera, settings.highest_camera
         )
         image = self._image(frame, known.world, None)
-        camera, depth, _, returned = reduced(frame, _PLANE_WIDTH, settings.near, settings.far)
+        camera, depth, _, returned = reduced(frame, RELOCALISE.plane_width, settings.near, settings.far)
         points = unproject(np.where(returned, depth, np.nan), camera)[returned]
         rng = np.random.default_rng([settings.seed, frame.stamp_ns])
         found = find_camera(prior, known.scene, image, points, settings.window, rng, self._devices)
@@ -223,11 +223,11 @@ class CameraTracker:
         for centre, radius in zip(*self._spheres(world), strict=True):
             middle = T_camera_world[:3, :3] @ centre + T_camera_world[:3, 3]
             with np.errstate(invalid="ignore"):
-                near |= ((points - middle) ** 2).sum(-1) < (radius + _NEAR_OBJECT) ** 2
+                near |= ((points - middle) ** 2).sum(-1) < (radius + NEAR_OBJECT) ** 2
         if world.table_visible:
             height = (points - T_camera_world[:3, 3]) @ T_camera_world[:3, 2]
             with np.errstate(invalid="ignore"):
-                near |= np.abs(height) < _NEAR_TABLE[0] + _NEAR_TABLE[1] * points[..., 2]
+                near |= np.abs(height) < NEAR_TABLE_PLANE[0] + NEAR_TABLE_PLANE[1] * points[..., 2]
             return np.where(near, IN_WORKSPACE, NO_RETURN)
         return np.where(returned, np.where(near, IN_WORKSPACE, BEYOND), NO_RETURN)
 
@@ -262,16 +262,16 @@ def _smooth_covariance(
     depth, slope, seen = rendered_slopes(pose, jnp.zeros(6), image, scene)
     rays = jnp.broadcast_to(image.ray_x, depth.shape), jnp.broadcast_to(image.ray_y[:, None], depth.shape)
     points = depth[..., None] * jnp.stack([*rays, jnp.ones_like(depth)], -1)
-    inner = seen & (jnp.abs(slope[:3]).max(0) < _STEEP)
+    inner = seen & (jnp.abs(slope[:3]).max(0) < STEEP)
     covariance = pose_covariance(jnp.where(inner, slope, 0.0), inner, points, error)
     objects = scene.world._replace(table_visible=jnp.asarray(False))
     alone = render_cameras(T_camera_world[None], objects, image, scene.library)[0]
     own = jnp.isfinite(alone) & (alone < jnp.where(seen, depth, jnp.inf) + 1e-3) & (image.pixel_class != NO_RETURN)
-    near = jnp.abs(image.depth - alone) < _EXPLAINED[0] + _EXPLAINED[1] * alone
+    near = jnp.abs(image.depth - alone) < EXPLAINED[0] + EXPLAINED[1] * alone
     count = own.sum()
     apart = jnp.where(own, ((points - pivot)[..., :2] ** 2).sum(-1), 0.0)
-    arm = jnp.sqrt(apart.sum() / jnp.maximum(count, 1) + _ARM**2)
-    outline = _OUTLINE * pivot[2] / image.focal[0]
+    arm = jnp.sqrt(apart.sum() / jnp.maximum(count, 1) + OUTLINE_ARM**2)
+    outline = OUTLINE_OFF_PIXELS * pivot[2] / image.focal[0]
     across = jnp.array([outline, outline, 0.0, 0.0, 0.0, outline / arm])
     covariance = covariance + jnp.where((error.bias > 0) | (error.waviness > 0), jnp.diag(across**2), 0.0)
     return covariance, (own & near).sum() / jnp.maximum(count, 1), count

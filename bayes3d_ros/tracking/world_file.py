@@ -12,7 +12,7 @@ from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.tracking.camera_estimate import KnownWorld, WorldError
 
-_FAR = 1e6  # metres
+_LARGEST_COORDINATE = 1e6  # metres, or of a quaternion
 _KEYS = ("type", "position", "orientation")
 
 
@@ -53,6 +53,6 @@ def _numbers(value: Any, key: str, count: int) -> Float[np.ndarray, "n"]:
         numbers = [np.nan if isinstance(v, bool) else float(v) for v in value]
     except (TypeError, ValueError, OverflowError):
         numbers = []
-    if len(numbers) != count or not np.all(np.abs(numbers) < _FAR):
+    if len(numbers) != count or not np.all(np.abs(numbers) < _LARGEST_COORDINATE):
         raise ValueError(f"{key}: expected {count} numbers, got {value!r}")
     return np.array(numbers)

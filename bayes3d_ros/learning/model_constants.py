@@ -1,0 +1,37 @@
+"""Changes the model that is learned: constants beside the settings.
+
+Vote weights and the rule of refusal were chosen on the four objects of `bayes3d evaluate learning`; what the others
+were chosen on is not recorded.
+"""
+
+import numpy as np
+
+# What stands on the table in a view (`segment.py`)
+TABLE_WITHIN = 0.05  # metres above and below the table that the pose promises, in which it is looked for
+LOWEST = 0.003, 0.010  # metres: the least and the largest height from which a return belongs to a thing
+EDGE_SHARE = 0.02  # share of the depth by which neighbours of a good pixel may differ
+FEWEST_PIXELS = 60  # that make a thing
+SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises above it is a swell of the table
+FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
+FOOT_WITHIN = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
+NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
+
+# Camera poses (`align.py`)
+POSE_PRIOR = 0.015, 0.015, np.deg2rad(0.8)  # standard deviations of a pose's error at the object: m, m, radians
+POINT_NOISE = 0.002  # metres, of a point against a surface of another view
+CORRELATED_POINTS = 5  # neighbouring points share their errors: so many count as one
+SAME_SIDE = 0.6  # cosine between normals of partners: the two sides of a wall are none
+RIM = 16, 0.4  # neighbours; share of their mean distance by which their middle is off at the rim of a surface
+
+# Refusal of views (`learn.py`)
+SEEN_THROUGH = 0.015  # metres: a view that sees something so far behind a point sees through it
+CONTRADICTED = 0.25  # share of a view's points that others see through, on average, from which it must go
+
+# Votes on voxels (`fuse.py`)
+# Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.
+HIT, PASS, GLIMPSE = 2.5, 3.0, 1.0
+BEHIND_VOXEL = 0.004  # metres, beside the voxel's own size, that a return lies behind a voxel that its ray passed
+LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
+FEWEST_VOXELS = 4  # of a piece that is kept
+FOOT = 0.015  # metres: what is seen so low is taken to reach down to the table
+THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)
