@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int, UInt8
 from numba import njit
 
 FARTHEST = 255  # voxels: the box reaches to where the grid ends, or beyond
-_MOST = 32  # voxels that other boxes have along an axis: longer ones take long to find and spare few steps
+_LONGEST_SIDE = 32  # voxels that other boxes have along an axis: longer ones take long to find and spare few steps
 OCTANTS = tuple(itertools.product((1, -1), repeat=3))  # signs of a direction along x, y, z; in this order everywhere
 
 
@@ -48,13 +48,19 @@ def _grown(sums: Int[np.ndarray, "X1 Y1 Z1"]) -> UInt8[np.ndarray, "X Y Z 3"]:
                 at_x = at_y = at_z = True
                 while at_x or at_y or at_z:
                     if at_x:
-                        at_x = bool(x + a < nx and a < _MOST and _solid(sums, x, y, z, x + a + 1, y + b, z + c) == 0)
+                        at_x = bool(
+                            x + a < nx and a < _LONGEST_SIDE and _solid(sums, x, y, z, x + a + 1, y + b, z + c) == 0
+                        )
                         a += at_x
                     if at_y:
-                        at_y = bool(y + b < ny and b < _MOST and _solid(sums, x, y, z, x + a, y + b + 1, z + c) == 0)
+                        at_y = bool(
+                            y + b < ny and b < _LONGEST_SIDE and _solid(sums, x, y, z, x + a, y + b + 1, z + c) == 0
+                        )
                         b += at_y
                     if at_z:
-                        at_z = bool(z + c < nz and c < _MOST and _solid(sums, x, y, z, x + a, y + b, z + c + 1) == 0)
+                        at_z = bool(
+                            z + c < nz and c < _LONGEST_SIDE and _solid(sums, x, y, z, x + a, y + b, z + c + 1) == 0
+                        )
                         c += at_z
                 cube[x, y, z] = min(a, b, c)
                 sides[x, y, z, 0] = FARTHEST if x + a >= nx else a

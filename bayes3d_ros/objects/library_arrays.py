@@ -12,12 +12,12 @@ from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.objects.empty_boxes import empty_boxes
 from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
-from bayes3d_ros.objects.self_symmetry import lookalikes
+from bayes3d_ros.objects.self_symmetry import self_symmetry
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
 INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
-SKETCH_POINTS = 96  # surface points a type, for the coarse score
+SURFACE_SAMPLES = 96  # of a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
 _TYPE_PAD, _VOXEL_PAD = 4, 1 << 19
@@ -42,9 +42,9 @@ class LibraryArrays(NamedTuple):
     hull_corner: Float[Array, "K 3 C"]  # of a convex solid around all that rays meet (`hull.py`), object frame
     hull_count: Int[Array, "K"]  # how many those are; the rest repeats one of them
     radius: Float[Array, "K"]  # of a ball about the box centre
-    sketch: Float[Array, "K P 3"]  # surface points, object frame
-    sketch_normal: Float[Array, "K P 3"]
-    sketch_area: Float[Array, "K"]  # metres^2 that one of them stands for
+    surface_point: Float[Array, "K P 3"]  # surface samples, object frame
+    surface_normal: Float[Array, "K P 3"]
+    surface_area: Float[Array, "K"]  # metres^2 that one of them stands for
     solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
     alike_face: Int[Array, "K 6 A"]  # placements that look like each other (`self_symmetry.py`)
     alike_shift: Float[Array, "K 6 A 3"]  # along the contact's own x and y, and yaw
@@ -106,11 +106,13 @@ def library_arrays(library: Library) -> LibraryArrays:
     models = library.models
     count = len(models)
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
-    sketch = [_spread(m.surface_points, SKETCH_POINTS) for m in models]
+    samples = [_spread(m.surface_points, SURFACE_SAMPLES) for m in models]
     hulls = [m.origin + _hull(m) * m.voxel_size for m in models]
     grids = [pack_voxels(m).ravel() for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
-    alike = [lookalikes(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)]
+    alike = [
+        self_symmetry(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)
+    ]
     first = np.concatenate([[0], np.cumsum([len(g) for g in grids])])
     if first[-1] > np.iinfo(np.int32).max:
         raise LibraryError(f"the library has {first[-1] // 8} voxels; {np.iinfo(np.int32).max // 8} can be addressed")
@@ -133,9 +135,9 @@ def library_arrays(library: Library) -> LibraryArrays:
         hull_corner=stack([np.pad(h, ((0, MOST_CORNERS - len(h)), (0, 0)), "edge").T for h in hulls]),
         hull_count=stack([np.array(len(h)) for h in hulls], np.int32),
         radius=stack([np.float32(0.5 * np.linalg.norm(m.box_size)) for m in models]),
-        sketch=stack([m.surface_points[s] for m, s in zip(models, sketch, strict=True)]),
-        sketch_normal=stack([m.surface_normal[s] for m, s in zip(models, sketch, strict=True)]),
-        sketch_area=stack([np.float32(len(m.surface_index) * m.voxel_size**2 / SKETCH_POINTS) for m in models]),
+        surface_point=stack([m.surface_points[s] for m, s in zip(models, samples, strict=True)]),
+        surface_normal=stack([m.surface_normal[s] for m, s in zip(models, samples, strict=True)]),
+        surface_area=stack([np.float32(len(m.surface_index) * m.voxel_size**2 / SURFACE_SAMPLES) for m in models]),
         solid=stack([p[_spread(p, SOLID_POINTS)] for p in map(_inside, models)]),
         alike_face=stack([a.face for a in alike], np.int32),
         alike_shift=stack([a.shift for a in alike]),

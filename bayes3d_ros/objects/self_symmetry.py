@@ -12,19 +12,19 @@ from scipy.spatial import cKDTree
 from bayes3d_ros.geometry.poses import slide
 
 ALIKE = 7  # kept for every face
-_TURNS = 60
-_POINTS = 64
-_ROUNDS = 5  # of halving the step in yaw
+_TURNS = 60  # in yaw, that are compared first
+_COMPARED_POINTS = 64  # of the surface
+_YAW_HALVINGS = 5  # of the step in yaw
 _SLIDES = 3  # at the end
 _ALIKE_WITHIN = 0.006  # metres, root mean square between the surfaces
-_FAR = 0.02  # metres: farther is no worse
+_CUT_OFF_M = 0.02  # metres: farther is no worse
 _HALF_TURN = 0.1  # radians off one
 _SQUARE_WITHIN = 0.1  # of the entries of a rotation, off quarter turns
 _AS_GOOD = 1e-4  # metres that those may lie farther off than the best turn found
 _SAME_TURN = 0.35  # radians: closer poses on one face are one mode
 
 
-class Lookalikes(NamedTuple):
+class SelfSymmetry(NamedTuple):
     """For each contact face, the faces on which the object looks alike, best first; the face itself where there are
     fewer. `shift` is (x, y) in metres along the placement's own axes, and yaw in radians, added to the placement's."""
 
@@ -38,19 +38,19 @@ class _Surface(NamedTuple):
     tree: cKDTree
 
 
-def lookalikes(
+def self_symmetry(
     points: Float[np.ndarray, "S 3"], normals: Float[np.ndarray, "S 3"], T_contact_object: Float[np.ndarray, "6 4 4"]
-) -> Lookalikes:
+) -> SelfSymmetry:
     """Compare the surface resting on every face and at every turn with itself; the best turns are made finer."""
     surface = _Surface(points, normals, cKDTree(points))
-    some = points[np.linspace(0, len(points) - 1, min(_POINTS, len(points))).astype(int)]
+    some = points[np.linspace(0, len(points) - 1, min(_COMPARED_POINTS, len(points))).astype(int)]
     resting = [some @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
     whole = [points @ T[:3, :3].T + T[:3, 3] for T in T_contact_object]
     centre = 0.5 * (points.max(0) + points.min(0))
     extent = np.array([np.ptp(w[:, 2]) for w in whole])
     middle = np.array([0.5 * (w.max(0) + w.min(0))[:2] for w in whole])
     faces = len(T_contact_object)
-    found = Lookalikes(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    found = SelfSymmetry(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
     turn = np.arange(_TURNS) * 2 * np.pi / _TURNS
     c, s = np.cos(turn), np.sin(turn)
     best: list[list[tuple[float, int, np.ndarray]]] = [[] for _ in range(faces)]
@@ -62,7 +62,7 @@ def lookalikes(
             shift, error = _slid(shift, resting[other], T, surface)
             lowest = (error <= np.roll(error, 1)) & (error <= np.roll(error, -1)) & (error < 2 * _ALIKE_WITHIN)
             shift, error = shift[lowest], error[lowest]
-            for halving in range(_ROUNDS if len(shift) else 0):
+            for halving in range(_YAW_HALVINGS if len(shift) else 0):
                 step = np.array([0, 0, np.pi / _TURNS / 2**halving])
                 tried = np.concatenate([shift - step, shift, shift + step])
                 tried, errors = (a.reshape(3, len(shift), -1) for a in _slid(tried, resting[other], T, surface))
@@ -88,11 +88,11 @@ def lookalikes(
     return _reversible(found)
 
 
-def _reversible(found: Lookalikes) -> Lookalikes:
+def _reversible(found: SelfSymmetry) -> SelfSymmetry:
     """Only ways that lead back exactly: of (a to b, b to a) one is made the other's inverse, a lone one gets an inverse
     where there is room and is dropped where there is none. A sampler may then jump along them."""
     faces = len(found.face)
-    paired = Lookalikes(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    paired = SelfSymmetry(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
     room = [ALIKE] * faces
 
     def add(face: int, other: int, shift: Float[np.ndarray, "3"]) -> None:
@@ -161,13 +161,15 @@ def _slid(
     y = s * points[:, 0] + c * points[:, 1] + shift[:, 1:2]
     at = np.stack([x, y, np.broadcast_to(points[:, 2], x.shape)], -1)
     local = (at - T_contact_object[:3, 3]) @ T_contact_object[:3, :3]
-    distance, index = surface.tree.query(local.reshape(-1, 3), distance_upper_bound=_FAR)
+    distance, index = surface.tree.query(local.reshape(-1, 3), distance_upper_bound=_CUT_OFF_M)
     distance, index = distance.reshape(x.shape), np.minimum(index, len(surface.points) - 1).reshape(x.shape)
     along = surface.normals[index]
     off = (along * (surface.points[index] - local)).sum(-1)  # to the surface's plane: its points lie a voxel apart
     near = np.isfinite(distance)
-    off = np.where(near, np.where(distance < 0.5 * _FAR, off, np.copysign(np.minimum(distance, _FAR), off)), 0.0)
-    error = np.sqrt(np.where(near, off**2, _FAR**2).mean(1))
+    off = np.where(
+        near, np.where(distance < 0.5 * _CUT_OFF_M, off, np.copysign(np.minimum(distance, _CUT_OFF_M), off)), 0.0
+    )
+    error = np.sqrt(np.where(near, off**2, _CUT_OFF_M**2).mean(1))
     normal = (along @ T_contact_object[:3, :3].T)[..., :2] * near[..., None]
     square = np.einsum("tpa,tpb->tab", normal, normal) + 0.5 * np.eye(2)
     slide = np.linalg.solve(square, (normal * off[..., None]).sum(1)[..., None])[..., 0]

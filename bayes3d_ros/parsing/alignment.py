@@ -1,4 +1,4 @@
-"""Pull coarse hypotheses onto the data: projective point-to-plane alignment of an object's sketch, along the three
+"""Pull coarse hypotheses onto the data: projective point-to-plane alignment of surface samples, along the three
 directions in which an object can slide and turn on the table."""
 
 import jax
@@ -17,12 +17,12 @@ from bayes3d_ros.parsing.tuning import SEARCH
 def align(
     placement: Placement, evidence: Evidence, image: ScoredImage, library: LibraryArrays, table: Table
 ) -> tuple[Placement, Float[Array, "N 3 3"]]:
-    """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over sketch points, per metre^2 of
+    """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over samples, per metre^2 of
     residual variance."""
 
     def step(placement: Placement, tolerance: Float[Array, ""]):
         T = T_camera_object(placement, library, table)
-        surface = in_camera(library.sketch[placement.type], library.sketch_normal[placement.type], T)
+        surface = in_camera(library.surface_point[placement.type], library.surface_normal[placement.type], T)
         p, n = surface
         z, u, v, seen = pixels_of(p, image)
         observed = evidence.depth[v, u]

@@ -1,6 +1,6 @@
-"""The coarse level: score every (type, face, yaw, x, y) cell with a sketch of the object, a few points of its surface.
+"""The coarse level: score every (type, face, yaw, x, y) cell by a few samples of the object's surface.
 
-A sketch point is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;
+A sample is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;
 where the camera sees past it, against; where something hides it, or nothing returned, it says nothing. Scores only
 choose where to look closer: they need not be right, and the sampler's weights are exact whatever they are.
 """
@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.cpu.call_frame import readable
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
@@ -30,7 +29,7 @@ class Evidence(NamedTuple):
     explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
 
 
-def sketch_score(
+def surface_score(
     placement: Placement,
     evidence: Evidence,
     image: ScoredImage,
@@ -41,7 +40,7 @@ def sketch_score(
     points: int,
 ) -> Float[Array, "N"]:
     """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
-    past, relative to the reward of one that matches; the first `points` of the sketch are used."""
+    past, relative to the reward of one that matches; the first `points` samples are used."""
     T = T_camera_object(placement, library, table)
     point, normal = _placed(T, placement.type, library, points)
     return _score(point, normal, _area(library, points)[placement.type], evidence, image, tolerance, penalty)
@@ -58,16 +57,16 @@ class _Vectors(NamedTuple):
 def _placed(
     T: Float[Array, "N 4 4"], type_id: Int[Array, "N"], library: LibraryArrays, points: int
 ) -> tuple[_Vectors, _Vectors]:
-    """The first `points` of the sketch and their normals in the camera frame."""
+    """The first `points` surface samples and their normals in the camera frame."""
     rotation, translation = T[:, :3, :3], T[:, :3, 3]
 
     def turned(vectors: Float[Array, "N P 3"]) -> _Vectors:
         r, (x, y, z) = rotation[..., None], (vectors[..., a] for a in range(3))
         return _Vectors(*(r[:, a, 0] * x + r[:, a, 1] * y + r[:, a, 2] * z for a in range(3)))
 
-    point = turned(library.sketch[type_id, :points])
+    point = turned(library.surface_point[type_id, :points])
     placed = _Vectors(*(along + translation[:, a][:, None] for a, along in enumerate(point)))
-    return placed, turned(library.sketch_normal[type_id, :points])
+    return placed, turned(library.surface_normal[type_id, :points])
 
 
 def _score(
@@ -135,10 +134,10 @@ def score_cells(
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Sketch scores of all cells, -inf where not searched: on CPUs by compiled loops."""
-    if jax.default_backend() != "cpu" or not readable():
+    """Scores of all cells, -inf where not searched: on CPUs by compiled loops."""
+    if jax.default_backend() != "cpu":
         return cells_in_turn(centres, count, evidence, image, library, table)
-    from bayes3d_ros.parsing.coarse_search_cpu import sketch_scores  # takes a while to import
+    from bayes3d_ros.parsing.coarse_search_cpu import cell_scores  # takes a while to import
 
     types, (face, yaw) = library.first.shape[0], _ways()
     tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points
@@ -147,7 +146,7 @@ def score_cells(
     zero = jnp.zeros(face.shape)
     T = T_camera_object(Placement(type_id, face, zero, zero, yaw), library, table)
     point, normal = (jnp.stack(v).reshape(3, *shape, points) for v in _placed(T, type_id, library, points))
-    scores = sketch_scores(
+    scores = cell_scores(
         point,
         normal,
         SEARCH.nats_a_pixel * _area(library, points) * image.focal[0] * image.focal[1],
@@ -169,8 +168,8 @@ def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
 
 
 def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
-    """Metres^2 that one of the first `points` of a type's sketch stands for."""
-    return library.sketch_area * library.sketch.shape[1] / points
+    """Metres^2 that one of the first `points` samples of a type stands for."""
+    return library.surface_area * library.surface_point.shape[1] / points
 
 
 def cells_in_turn(
@@ -181,7 +180,7 @@ def cells_in_turn(
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Sketch scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
+    """Scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
     types, (face, yaw) = library.first.shape[0], _ways()
     ways = NUM_FACES * SEARCH.yaws
     tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points

@@ -7,17 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
-_TARGET = "bayes3d_sketch_scores"  # to XLA
-_SKETCHES_AT_ONCE = 8  # their points stay in the first-level cache, and are a multiple of a vector
+_TARGET = "bayes3d_cell_scores"  # to XLA
+_ORIENTATIONS_AT_ONCE = 8  # their points stay in the first-level cache, and are a multiple of a vector
 _NEAREST_M, _FARTHEST_M = 0.02, 1e6  # metres
 
 f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/loops.py`
 
 
-def sketch_scores(
+def cell_scores(
     point: Float[Array, "3 K Y P"],
     normal: Float[Array, "3 K Y P"],
     worth: Float[Array, "K"],
@@ -31,8 +31,8 @@ def sketch_scores(
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "C K Y"]:
-    """Scores of sketches of Y orientations of each type, moved to each of the first `count` places, -inf for other
-    places and types. `worth` is what a point explained is worth at 1 m; `camera` is focal length and centre."""
+    """Scores of surface samples of Y orientations of each type, moved to each of the first `count` places, -inf for
+    other places and types. `worth` is what a point explained is worth at 1 m; `camera` is focal length and centre."""
     known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST_M), 0.0, _FARTHEST_M)
     focal, centre = camera
     inputs = (
@@ -61,7 +61,7 @@ class _Image(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points of a few sketches, side by side."""
+    """Samples of a few orientations, side by side."""
 
     pixel: Int[np.ndarray, "S"]
     z: Float[np.ndarray, "S"]
@@ -142,8 +142,8 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
         scores[k] = f32(-np.inf)
     stride = types * ways * size
     for type_id in range(num_types):
-        for way in range(0, ways, _SKETCHES_AT_ONCE):
-            some = min(_SKETCHES_AT_ONCE, ways - way)
+        for way in range(0, ways, _ORIENTATIONS_AT_ONCE):
+            some = min(_ORIENTATIONS_AT_ONCE, ways - way)
             first, full = (type_id * ways + way) * size, some * size
             for place in range(count):
                 _project(
@@ -157,9 +157,9 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
                     scores[to + k] = worth[type_id] * _sum(points.area, k * size, size)
 
 
-@handler
-def _sketch(frame):
-    """See `sketch_scores`."""
+@cfunc(types.int64(types.int64), cache=True)
+def _cell_scores(frame):
+    """See `cell_scores`."""
     if answered_version(frame):
         return 0
     numbers, sizes = floats(frame, 7), integers(frame, 8)
@@ -171,9 +171,9 @@ def _sketch(frame):
     _score(
         floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), image, np.int64(sizes[2]),
         np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(types),
-        _new_points(_SKETCHES_AT_ONCE * sizes[4]), float_results(frame, 0),
+        _new_points(_ORIENTATIONS_AT_ONCE * sizes[4]), float_results(frame, 0),
     )  # fmt: skip
     return 0
 
 
-register(_TARGET, _sketch)
+register(_TARGET, _cell_scores)

@@ -1,4 +1,4 @@
-"""Depth that neighbours agree on: where most returns are outliers, a few points of a sketch seldom meet a good one."""
+"""Depth that neighbours agree on: where most returns are outliers, a few surface samples seldom meet a good one."""
 
 import jax
 import jax.numpy as jnp

@@ -185,7 +185,7 @@ def log_shares(mass: Float[Array, "M"], type_id: Int[Array, "M"]) -> Float[Array
     return jax.nn.log_softmax(trust_types * of_type(mass) + trust * mass - of_type(trust * mass))
 
 
-def with_lookalikes(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
+def with_self_symmetry(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
     """Each component and the poses where its object looks alike (`self_symmetry.py`), sharing its weight by their log
     likelihoods: a search that found one of them need not have found the others."""
     at, scale = modes.centre, modes.scale

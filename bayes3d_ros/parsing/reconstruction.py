@@ -17,7 +17,7 @@ from bayes3d_ros.likelihood.tiles import BEHIND
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.parsing.support_plane import table_depth
 
-_RAYS_AT_ONCE = 1 << 14  # one compilation for any image
+_RAYS_A_CALL = 1 << 14  # one compilation for any image
 _MARGIN_PIXELS = 2  # pixels about what the corners of an object's grid enclose: more than rounding may move them
 
 _walk = jax.jit(march)
@@ -77,9 +77,9 @@ def _along(
     """Depth of an object along rays (x, y, 1), inf where it is not met."""
     depth = np.full(len(rays), np.inf, np.float32)
     pose = T.astype(np.float32)
-    for first in range(0, len(rays), _RAYS_AT_ONCE):
-        some = rays[first : first + _RAYS_AT_ONCE]
-        x, y = np.zeros((2, _RAYS_AT_ONCE), np.float32)
+    for first in range(0, len(rays), _RAYS_A_CALL):
+        some = rays[first : first + _RAYS_A_CALL]
+        x, y = np.zeros((2, _RAYS_A_CALL), np.float32)
         x[: len(some)], y[: len(some)] = some[:, 0], some[:, 1]
-        depth[first : first + _RAYS_AT_ONCE] = np.asarray(_walk(library, jnp.int32(type_id), pose, (x, y)))[: len(some)]
+        depth[first : first + _RAYS_A_CALL] = np.asarray(_walk(library, jnp.int32(type_id), pose, (x, y)))[: len(some)]
     return depth

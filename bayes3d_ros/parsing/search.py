@@ -1,5 +1,5 @@
-"""From the whole space of one object to a proposal: cells scored with sketches, the best of them aligned to the data,
-the best of those scored with the model itself and narrowed round by round."""
+"""From the whole space of one object to a proposal: cells scored by surface samples, the best of them aligned to the
+data, the best of those scored with the model itself and narrowed round by round."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal, near_peak, peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage, halved
-from bayes3d_ros.objects.library_arrays import NUM_FACES, SKETCH_POINTS, LibraryArrays
+from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
@@ -21,7 +21,7 @@ from bayes3d_ros.parsing.coarse_search import (
     cells_to_search,
     hidden_cells,
     score_cells,
-    sketch_score,
+    surface_score,
 )
 from bayes3d_ros.parsing.consensus import consensus
 from bayes3d_ros.parsing.context import Context
@@ -35,7 +35,7 @@ from bayes3d_ros.parsing.mode_search import (
     narrow,
     sharpen,
     take,
-    with_lookalikes,
+    with_self_symmetry,
 )
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, wrap
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
@@ -131,7 +131,7 @@ def candidates(
     placement, information = align(placement, evidence, image, library, table)
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
-    score = sketch_score(placement, evidence, image, library, table, 0.01, 1.0, SKETCH_POINTS)
+    score = surface_score(placement, evidence, image, library, table, 0.01, 1.0, SURFACE_SAMPLES)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
@@ -241,7 +241,7 @@ def _searched(
 
     modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, SEARCH.fit_rounds)
     mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
-    return with_lookalikes(mixture, exact, library), pilots
+    return with_self_symmetry(mixture, exact, library), pilots
 
 
 def _grid_with(
@@ -255,6 +255,6 @@ def _grid_with(
 def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:
     """A mixture and pilots of the same shapes, which nothing uses."""
     modes = as_mixture(take(found, slice(SEARCH.finalists)), jnp.zeros(SEARCH.finalists))
-    mixture = with_lookalikes(modes, lambda placement: jnp.zeros(placement.type.shape), library)
+    mixture = with_self_symmetry(modes, lambda placement: jnp.zeros(placement.type.shape), library)
     nobody = jax.tree.map(lambda a: jnp.zeros(SEARCH.pilot_draws, a.dtype), found.placement)
     return mixture, Pilots(nobody, jnp.zeros(SEARCH.pilot_draws), jnp.zeros(SEARCH.pilot_draws))

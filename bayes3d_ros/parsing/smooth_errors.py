@@ -27,7 +27,7 @@ from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 
 # These change the posterior.
-_SAMPLES_AN_OBJECT = 48  # of an object's sketch
+_SAMPLES_AN_OBJECT = 48  # of its surface
 _HIDDEN_BEHIND_M = 0.01  # metres behind what is seen in front, from which a point is hidden
 _OUTLINE_SHARE = 0.03  # share of the visible points by which outlines, which the field does not move, hold an object
 _OUTLINE_ARM_M = 0.03  # metres, of the yaw that outlines hold
@@ -53,7 +53,7 @@ def offset_covariance(
     type_id, face = jnp.maximum(objects.type, 0), jnp.maximum(objects.face, 0)
     T = T_camera_object(objects._replace(type=type_id, face=face), library, table)
     some = slice(_SAMPLES_AN_OBJECT)
-    surface = in_camera(library.sketch[type_id][..., some, :], library.sketch_normal[type_id][..., some, :], T)
+    surface = in_camera(library.surface_point[type_id][..., some, :], library.surface_normal[type_id][..., some, :], T)
     p, _ = surface
     _, u, v, inside = pixels_of(p, image)
     front = scenes[jnp.arange(len(scenes))[:, None, None], v + half, u + half]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 class SearchTuning(NamedTuple):
     """From the whole space of one object to a mixture that fits the likelihood."""
 
-    # Sketches over cells (`coarse_search.py`)
+    # Surface samples over cells (`coarse_search.py`)
     cell: float = 0.02  # metres, side of a cell; not recorded
     yaws: int = 24  # a turn; not recorded
     most_cells: int = 512  # searched; not recorded
@@ -19,7 +19,7 @@ class SearchTuning(NamedTuple):
     # it belongs to.
     coarse_tolerance: float = 0.02
     coarse_penalty: float = 0.5  # of a point seen past, relative to the reward of one that matches; not recorded
-    coarse_points: int = 36  # of a sketch; not recorded
+    coarse_points: int = 36  # surface samples of a type; not recorded
     reach: int = 3  # cells: how far from unexplained returns an object's centre is looked for; not recorded
     nats_a_pixel: float = 8.0  # what a pixel explained is worth, roughly; not recorded
     # Consensus of neighbours (`consensus.py`): of 40 good returns among 200 bad ones 36 points meet too few

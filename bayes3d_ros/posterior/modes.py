@@ -23,7 +23,7 @@ VALLEY = 4.0  # the lower peak over the pass to a higher one, from which the two
 NEIGHBOURS = 8.0  # effective samples within a kernel's width, but no more than ...
 SHARE = 1 / 6  # ... this share of the weight: six single poses may be six modes
 SPARSE = 0.2  # share of the weight that may have fewer neighbours
-NEGLIGIBLE = 0.02  # weight of a mode that is not worth listing
+NEGLIGIBLE_SHARE = 0.02  # weight of a mode that is not worth listing
 DENSE = 0.5  # the middle of a mode lies where it is at least this much as dense as at its peak
 MOST_NODES = 256  # more poses than this are represented by the so many that cover them best
 
@@ -143,11 +143,11 @@ def mode_labels(
     """The mode of every pose, 0 for the heaviest; -1 where it is left out.
 
     Poses on different contact faces (they differ by 90 degrees or more) are in different modes. Poses that are in no
-    mode of a share of NEGLIGIBLE or more are gathered in one more mode where together they make up as much, else they
+    mode of a share of NEGLIGIBLE_SHARE or more are gathered in one more mode where together they make up as much, else they
     are left out.
     """
     labels = np.full(len(weights), -1)
-    counts = len(weights) * weights / weights.sum() >= NEGLIGIBLE / 2  # lighter ones are together less than 1 %
+    counts = len(weights) * weights / weights.sum() >= NEGLIGIBLE_SHARE / 2  # lighter ones are together less than 1 %
     groups = 0
     for side in np.unique(face[counts]):
         own = np.flatnonzero(counts & (face == side))
@@ -159,10 +159,10 @@ def mode_labels(
             labels[own] = groups + np.unique(peaks(found), return_inverse=True)[1].ravel()[found.owner]
         groups = int(labels.max()) + 1
     share = np.bincount(labels + 1, weights, groups + 1)[1:] / weights.sum()
-    rest = np.isin(labels, np.flatnonzero(share < NEGLIGIBLE))
-    if weights[rest].sum() >= NEGLIGIBLE * weights.sum():
+    rest = np.isin(labels, np.flatnonzero(share < NEGLIGIBLE_SHARE))
+    if weights[rest].sum() >= NEGLIGIBLE_SHARE * weights.sum():
         labels[rest] = groups
-        share = np.append(np.where(share < NEGLIGIBLE, 0.0, share), weights[rest].sum() / weights.sum())
+        share = np.append(np.where(share < NEGLIGIBLE_SHARE, 0.0, share), weights[rest].sum() / weights.sum())
     else:
         labels[rest] = -1
     rank = np.full(len(share) + 1, -1)

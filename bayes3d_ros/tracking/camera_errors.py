@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 from bayes3d_ros.parsing.smooth_errors import SmoothError
 from bayes3d_ros.tracking.model_constants import HELD_SHARE
 
-_WAVES = 64  # that stand for the field; not recorded
-_FREQUENCIES = np.random.default_rng(0).normal(size=(_WAVES, 3)).astype(np.float32)
+_COSINES = 64  # that stand for the field; not recorded
+_FREQUENCIES = np.random.default_rng(0).normal(size=(_COSINES, 3)).astype(np.float32)
 _BLOCKED = 1e-9  # beside a sum of square slopes: no division by zero
 
 
@@ -27,7 +27,7 @@ def pose_covariance(
     J = slope / unit[:, None, None]
     square = jnp.einsum("ahw,bhw->ab", J, J, precision="highest") + HELD_SHARE * jnp.eye(6)
     phase = jnp.einsum("hwa,ka->khw", points, jnp.asarray(_FREQUENCIES) / error.length)
-    waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)]) * (error.waviness / jnp.sqrt(_WAVES))
+    waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)]) * (error.waviness / jnp.sqrt(_COSINES))
     fields = jnp.concatenate([waves, jnp.full((1, *seen.shape), error.bias)]) * seen
     moved = jnp.linalg.solve(square, jnp.einsum("ahw,khw->ak", J, fields, precision="highest"))
     moved = moved / unit[:, None]

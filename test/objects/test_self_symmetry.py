@@ -7,13 +7,13 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES, contact_transform
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.self_symmetry import lookalikes
+from bayes3d_ros.objects.self_symmetry import self_symmetry
 
 
 def of(mesh):
     model = model_from_mesh(mesh, "thing", 0.004)
     T = np.stack([contact_transform(model, face) for face in range(NUM_FACES)])
-    return model, T, lookalikes(model.surface_points, model.surface_normal, T)
+    return model, T, self_symmetry(model.surface_points, model.surface_normal, T)
 
 
 def others(found, face):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.posterior.modes import MOST_NODES, NEGLIGIBLE, mode_labels, nodes
+from bayes3d_ros.posterior.modes import MOST_NODES, NEGLIGIBLE_SHARE, mode_labels, nodes
 from bayes3d_ros.posterior.pose_statistics import PoseStatistics, pose_statistics, rotation_vectors
 
 OFF_AXIS = np.array([0.06, 0.0, 0.0])  # the mesh's origin, seen from the axis that the yaw turns about
@@ -41,7 +41,7 @@ def test_weights_sum_to_one_heaviest_first_and_the_first_is_the_estimate(seed: i
     found = pose_statistics(*several(seed))
     weights = [mode.weight for mode in found.modes]
     assert sum(weights) == pytest.approx(1.0) and weights == sorted(weights, reverse=True)
-    assert min(weights) >= NEGLIGIBLE * 0.99 and len(weights) >= 3
+    assert min(weights) >= NEGLIGIBLE_SHARE * 0.99 and len(weights) >= 3
     np.testing.assert_array_equal(found.position, found.modes[0].position)
     np.testing.assert_array_equal(found.orientation, found.modes[0].orientation)
     for mode in found.modes:
