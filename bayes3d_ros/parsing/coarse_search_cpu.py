@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.cpu.compiling import allocating, fast
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
 _TARGET = "bayes3d_cell_scores"  # to XLA
@@ -157,7 +157,7 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
                     scores[to + k] = worth[type_id] * _sum(points.area, k * size, size)
 
 
-@cfunc(types.int64(types.int64), cache=True)
+@handler
 def _cell_scores(frame):
     """See `cell_scores`."""
     if answered_version(frame):

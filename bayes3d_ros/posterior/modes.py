@@ -143,8 +143,8 @@ def mode_labels(
     """The mode of every pose, 0 for the heaviest; -1 where it is left out.
 
     Poses on different contact faces (they differ by 90 degrees or more) are in different modes. Poses that are in no
-    mode of a share of NEGLIGIBLE_SHARE or more are gathered in one more mode where together they make up as much, else they
-    are left out.
+    mode of a share of NEGLIGIBLE_SHARE or more are gathered in one more mode where together they make up as much, else
+    they are left out.
     """
     labels = np.full(len(weights), -1)
     counts = len(weights) * weights / weights.sum() >= NEGLIGIBLE_SHARE / 2  # lighter ones are together less than 1 %
