@@ -1,10 +1,8 @@
 """The camera_tracker node: depth images in, where the camera is in the world that it first saw out."""
 
 import contextlib
-import os
 import sys
 import time
-import traceback
 from collections import deque
 from dataclasses import fields
 from pathlib import Path
@@ -14,30 +12,26 @@ import jax
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.jax_runtime import enable_cache, every_core
-from bayes3d_ros.objects.model import Library, LibraryError, load_library
+from bayes3d_ros.jax_runtime import every_core
+from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
-from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT, Health, InputView, judge, one_line
+from bayes3d_ros.ros.depth_inputs import DepthMessages
+from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
+from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
 from bayes3d_ros.ros.parameters import (
     CAMERA_TRACKER_SETTINGS,
+    DEPTH_INPUT_PARAMETERS,
     CameraTrackerNodeSettings,
-    DepthInputSettings,
-    SettingsParameters,
 )
 from bayes3d_ros.ros.spinning import run
-from bayes3d_ros.ros.worker import NewestWorker
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.session import CameraFollower
@@ -45,8 +39,7 @@ from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
 from bayes3d_ros.tracking.world_file import load_world
 
 _RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-_TRACKER_PARAMETERS = ("library", "world", *(f.name for f in fields(TrackerSettings)))
-_INPUT_PARAMETERS = tuple(f.name for f in fields(DepthInputSettings))
+_TRACKER_PARAMETERS = {"library", "world", *(f.name for f in fields(TrackerSettings))}
 
 _PURPOSE = "Depth images in, where the camera is in the world that it first saw out."
 
@@ -78,79 +71,68 @@ class CameraTrackerNode(Node):
     def __init__(self, make=make_follower) -> None:
         super().__init__("camera_tracker")
         self._make = make
-        self._health = Health()
-        self._settings = SettingsParameters(self, CAMERA_TRACKER_SETTINGS)
+        self._parts = InferenceParts(
+            self,
+            CAMERA_TRACKER_SETTINGS,
+            self._process,
+            remedy="call ~/reset",
+            report=self._report,
+            changed=self._parameters_changed,
+        )
         self._session: _Session | None = None
         self._known: Tracking | None = None  # the worker's own
-        self._refusal, self._told = "", ""
-        self._received_before, self._dropped_before = 0, 0
+        self._told = ""
         self._path: deque[PoseStamped] = deque(maxlen=self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", _RELIABLE)
         self._particles = self.create_publisher(PoseArray, "~/particles", _RELIABLE)
         self._trail = self.create_publisher(PathMessage, "~/path", _RELIABLE)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._worker: NewestWorker[DepthMessages] = NewestWorker(self._process, self._worker_failed)
-        self._inputs: DepthInputs | None = None
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.add_on_set_parameters_callback(self._on_set_parameters)
-        self.add_post_set_parameters_callback(self._after_set_parameters)
-        self._open_inputs()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(1.0, self._report, clock=steady)
+        self._listen()
         self._begin()
 
     def stop(self, timeout: float) -> bool:
         """Stop the worker; False if it is in the middle of something longer than `timeout` seconds."""
-        return self._worker.stop(timeout)
+        return self._parts.stop(timeout)
 
     # The tracker
 
     def _node_settings(self) -> CameraTrackerNodeSettings:
-        try:
-            return self._settings.read(CameraTrackerNodeSettings)
-        except ValueError:
-            return CameraTrackerNodeSettings()  # `_begin` says what is wrong
+        return self._parts.settings.in_use(CameraTrackerNodeSettings)  # `_begin` says what is wrong
 
     def _begin(self) -> str:
         """Have the worker make a tracker from the parameters as they are now; what is wrong, or empty."""
         try:
-            node = self._settings.read(CameraTrackerNodeSettings)
-            settings = self._settings.read(TrackerSettings)
-            if not node.library:
-                raise ValueError("parameter library is not set: expected a folder of object models (bayes3d import)")
-            library = load_library(Path(node.library).expanduser())
+            node = self._parts.settings.read(CameraTrackerNodeSettings)
+            settings = self._parts.settings.read(TrackerSettings)
+            library = library_in(node.library)
             world = load_world(Path(node.world).expanduser(), settings.table, library) if node.world else None
         except (ValueError, LibraryError, WorldError) as error:
-            self._refusal = str(error)
-            self.get_logger().error(f"{error}; correct it, then call ~/reset")
+            self._parts.refuse(str(error))
             return str(error)
-        self._refusal, self._told = "", "the next frame shows the world"
+        self._parts.refusal, self._told = "", "the next frame shows the world"
         if world is not None:
             self._told = f"the world is {len(world.types)} known object{'s' * (len(world.types) != 1)}"
 
         def job() -> None:
             self._known, self._session = None, None
             self._path.clear()
-            self._health.begin()
+            self._parts.health.begin()
             try:
-                with self._health.doing("loading the library"):
+                with self._parts.health.doing("loading the library"):
                     self._session = _Session(self._make(library, settings, world), jax.default_backend())
             except Exception as error:
-                self._refusal = f"cannot make the tracker: {one_line(error)}"
-                self.get_logger().error(self._refusal)
-                self.get_logger().debug(traceback.format_exc())
+                self._parts.refusal = self._parts.failure("cannot make the tracker", error)
+                self.get_logger().error(self._parts.refusal)
                 return
             self.get_logger().info(f"{self._told}; inference on {self._session.backend}")
 
-        self._worker.call(job)
+        self._parts.worker.call(job)
         return ""
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Load the library, forget the world and the camera."""
         problem = self._begin()
-        response.success = not problem
-        response.message = problem or self._told
-        return response
+        return answer(response, problem, self._told)
 
     # Frames
 
@@ -158,18 +140,18 @@ class CameraTrackerNode(Node):
         """On the worker's thread: one frame from messages to messages."""
         session = self._session
         if session is None:
-            self._health.discard()
+            self._parts.health.discard()
             return
         try:
             frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
             with self._working(session.follower, frame):
                 known, estimate = session.follower.step(self._known, frame)
         except (ValueError, TrackingError, ParseError) as error:
-            self._problem(f"lost: {error}" if self._known is not None else str(error))
+            self._parts.problem(f"lost: {error}" if self._known is not None else str(error))
             return
         self._known = known
         if estimate.lost:
-            self._problem(f"lost: {estimate.lost}")
+            self._parts.problem(f"lost: {estimate.lost}")
             return
         settings = self._node_settings()
         world = settings.table_frame
@@ -178,81 +160,49 @@ class CameraTrackerNode(Node):
         self._path.append(path_pose(estimate, world))
         if self._trail.get_subscription_count():  # grows with every frame
             self._trail.publish(PathMessage(header=self._path[-1].header, poses=list(self._path)))
-        self._health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
+        self._parts.health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
 
     def _working(self, follower: Follower, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
         """What the node does meanwhile, for diagnostics."""
         height, width = frame.depth.shape
         what = "looking at the first frame" if self._known is None else "tracking one frame"
         if follower.compiled_for(width, height, self._known):
-            return self._health.doing(what, usual=QUIET)
+            return self._parts.health.doing(what, usual=QUIET)
         # Part of it waits until a world is seen, so that this may be said of several frames.
         told = f"compiling for images of {width}x{height}; a minute or two the first time"
         self.get_logger().info(told, throttle_duration_sec=REPEAT)
-        return self._health.doing(f"compiling for images of {width}x{height} and {what}")
-
-    def _worker_failed(self, error: Exception) -> None:
-        self._problem(f"internal error, please report it: {one_line(error)}")
-        self.get_logger().debug("".join(traceback.format_exception(error)))
-
-    def _problem(self, text: str) -> None:
-        if self._health.problem(text):
-            self.get_logger().warning(f"no output: {text}")
+        return self._parts.health.doing(f"compiling for images of {width}x{height} and {what}")
 
     # Inputs and parameters
 
-    def _open_inputs(self) -> None:
+    def _listen(self) -> None:
         # Only the first frame is placed by a pose; later ones need not wait for theirs.
-        settings = self._node_settings()
-        self._inputs = DepthInputs(self, self._worker.submit, settings, wants_pose=lambda: self._known is None)
+        self._parts.listen(self._parts.worker.submit, wants_pose=lambda: self._known is None)
 
-    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        return self._settings.check(parameters)
-
-    def _after_set_parameters(self, parameters: list[Parameter]) -> None:
-        names = {p.name for p in parameters}
-        if self._inputs is not None and names & set(_INPUT_PARAMETERS):
-            self._inputs.close()
-            self._received_before += self._inputs.received
-            self._dropped_before += self._inputs.dropped
-            self._open_inputs()
+    def _parameters_changed(self, names: set[str]) -> None:
+        if names & DEPTH_INPUT_PARAMETERS:
+            self._listen()
         if "path_length" in names:
             self._path = deque(self._path, self._node_settings().path_length)
-        if names & set(_TRACKER_PARAMETERS):
+        if names & _TRACKER_PARAMETERS:
             self._begin()
 
     # Diagnostics
 
-    def _report(self) -> None:
-        assert self._inputs is not None
-        view = self._inputs.view()
-        level, message = self._why(view)
+    def _report(self) -> DiagnosticArray:
+        assert self._parts.inputs is not None
+        view = self._parts.inputs.view()
+        told = (ERROR, self._parts.refusal) if self._parts.refusal else self._parts.judge(view, good="tracking")
         session = self._session
-        self._health.backend = session.backend if session else ""
-        report = self._health.report(
-            f"{self.get_fully_qualified_name()}: camera tracking",
-            level,
-            message,
-            state="tracking" if level == OK else "waiting" if self._known is None else "lost",
-            received=self._received_before + self._inputs.received,
-            dropped=self._dropped_before + self._worker.dropped + self._inputs.dropped,
-            view=view,
-        )
-        self._diagnostics.publish(report)
-
-    def _why(self, view: InputView) -> tuple[bytes, str]:
-        """The level and the one line that says whether there is output, and if not, why."""
-        if self._refusal:
-            return ERROR, self._refusal
-        return judge(self._health, view, idle=self._worker.idle, good="tracking")
+        self._parts.health.backend = session.backend if session else ""
+        state = "tracking" if told[0] == OK else "waiting" if self._known is None else "lost"
+        return self._parts.health_report("camera tracking", told, state, view)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
     check_arguments("camera_tracker", _PURPOSE, args)
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a robot's GPU has other users
-    with contextlib.suppress(OSError):  # a home that cannot be written to costs a compilation, not the node
-        enable_cache()
+    prepare_jax()
     every_core()
     return run(CameraTrackerNode, args)
 

@@ -4,15 +4,11 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -32,7 +28,8 @@ from bayes3d_ros.learning.segment import Thing, ViewError, segment
 from bayes3d_ros.objects.model import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
-from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
+from bayes3d_ros.ros.depth_inputs import DepthMessages
+from bayes3d_ros.ros.depth_node import DepthNodeParts
 from bayes3d_ros.ros.diagnostics import (
     ERROR,
     OK,
@@ -45,19 +42,16 @@ from bayes3d_ros.ros.diagnostics import (
     why_no_input,
 )
 from bayes3d_ros.ros.parameters import (
+    DEPTH_INPUT_PARAMETERS,
     OBJECT_LEARNER_SETTINGS,
-    DepthInputSettings,
     ObjectLearnerNodeSettings,
     Settings,
-    SettingsParameters,
 )
 from bayes3d_ros.ros.spinning import run
 from bayes3d_ros.ros.summary import key_values
 from bayes3d_ros.settings import LearnerSettings
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_INPUTS = tuple(f.name for f in fields(DepthInputSettings))
-
 
 _Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
 
@@ -74,25 +68,21 @@ class ObjectLearnerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("object_learner")
-        self._settings = SettingsParameters(self, OBJECT_LEARNER_SETTINGS)
-        self._inputs: DepthInputs | None = None
+        self._parts = DepthNodeParts(
+            self, OBJECT_LEARNER_SETTINGS, report=self._report, changed=self._parameters_changed
+        )
         self._newest: DepthMessages | None = None
         self._seen: dict[int, Thing] = {}  # what the captures of `_seen_of` show, by stamp
         self._seen_of: Path | None = None
         self._last = ""
         self._model = self.create_publisher(PointCloud2, "~/model", _LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         for name, action in (("capture", self._capture), ("build", self._build), ("reset", self._reset)):
             self.create_service(Trigger, f"~/{name}", self._answer(name, action))
-        self.add_on_set_parameters_callback(self._on_set_parameters)
-        self.add_post_set_parameters_callback(self._after_set_parameters)
-        self._open_inputs()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        self.create_timer(1.0, self._report, clock=steady)
+        self._listen()
 
     def stop(self, timeout: float) -> bool:
         """There is no thread to wait for."""
-        return True
+        return self._parts.stop(timeout)
 
     # Services
 
@@ -183,7 +173,7 @@ class ObjectLearnerNode(Node):
 
     def _read(self, kind: type[Settings]) -> Settings:
         try:
-            return self._settings.read(kind)
+            return self._parts.settings.read(kind)
         except ValueError as error:
             raise Refusal(str(error)) from None
 
@@ -220,13 +210,13 @@ class ObjectLearnerNode(Node):
 
     def _newest_frame(self) -> DepthFrame:
         settings, messages = self._node_settings(), self._newest
-        assert self._inputs is not None
+        assert self._parts.inputs is not None
         if messages is None:
-            view = self._inputs.view()
+            view = self._parts.inputs.view()
             raise Refusal(why_no_input(view) or f"no image is complete yet: {where_images_are(view)}")
         age = time.monotonic() - messages.arrived
         if age > settings.max_age:
-            why = why_no_input(self._inputs.view())
+            why = why_no_input(self._parts.inputs.view())
             raise Refusal(f"the newest image came {age:.1f} s ago" + (f": {why}" if why else ""))
         try:
             frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
@@ -250,32 +240,25 @@ class ObjectLearnerNode(Node):
 
     # Inputs and parameters
 
-    def _open_inputs(self) -> None:
-        try:
-            settings = self._settings.read(ObjectLearnerNodeSettings)
-        except ValueError as error:
-            self.get_logger().error(str(error))
-            settings = ObjectLearnerNodeSettings()
-        self._inputs = DepthInputs(self, self._keep, settings, use_pose="required")
+    def _listen(self) -> None:
+        if self._parts.settings.problems:
+            self.get_logger().error("; ".join(self._parts.settings.problems.values()))
+        self._parts.listen(self._keep, use_pose="required")
 
     def _keep(self, messages: DepthMessages) -> None:
         self._newest = messages
 
-    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        return self._settings.check(parameters)
-
-    def _after_set_parameters(self, parameters: list[Parameter]) -> None:
-        if self._inputs is not None and any(p.name in _INPUTS for p in parameters):
-            self._inputs.close()
+    def _parameters_changed(self, names: set[str]) -> None:
+        if names & DEPTH_INPUT_PARAMETERS:
             self._newest = None
-            self._open_inputs()
+            self._listen()
         self._seen_of = None
 
     # Diagnostics
 
-    def _report(self) -> None:
-        assert self._inputs is not None
-        view = self._inputs.view()
+    def _report(self) -> DiagnosticArray:
+        assert self._parts.inputs is not None
+        view = self._parts.inputs.view()
         level, message = self._why(view)
         stamp = "none" if self._newest is None else str(stamp_to_ns(self._newest.image.header.stamp))
         if self._newest is not None and self._newest.pose.T_table_camera is None:
@@ -284,20 +267,20 @@ class ObjectLearnerNode(Node):
         status = DiagnosticStatus(name=name, level=level, message=message, hardware_id="none")
         status.values = key_values(
             newest_stamp=stamp,
-            received=str(self._inputs.received),
-            complete=str(self._inputs.delivered),
-            dropped=str(self._inputs.dropped),
+            received=str(self._parts.received),
+            complete=str(self._parts.delivered),
+            dropped=str(self._parts.dropped),
             waiting=str(view.waiting),
             camera_pose=view.pose_source,
             notes="; ".join([*warnings(view), *notes(view)]),
             last=self._last,
         )
-        self._diagnostics.publish(diagnostic_array(status))
+        return diagnostic_array(status)
 
     def _why(self, view: InputView) -> tuple[bytes, str]:
         """The level and the one line that says whether a view can be captured, and if not, why."""
-        if self._settings.problems:
-            return ERROR, "; ".join(self._settings.problems.values())
+        if self._parts.settings.problems:
+            return ERROR, "; ".join(self._parts.settings.problems.values())
         if why := why_no_input(view):
             return WARN, why
         if self._newest is None or not view.delivering:

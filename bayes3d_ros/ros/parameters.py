@@ -111,7 +111,8 @@ NODE_SETTINGS = {
     "object_learner": OBJECT_LEARNER_SETTINGS,
     "camera_tracker": CAMERA_TRACKER_SETTINGS,
 }
-# Those of an active node that are taken when they are set; the others of its inputs wait for the next activation.
+DEPTH_INPUT_PARAMETERS = frozenset(f.name for f in fields(DepthInputSettings))
+# Those of an active scene_parser that are taken when they are set; its other inputs wait for the next activation.
 INPUT_PARAMETERS = ("camera_pose", "pose_max_gap", "pose_tolerance")
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
 
@@ -140,6 +141,10 @@ class SettingsParameters:
             return self._build(kind, {})
         except ValueError as error:
             raise ValueError(f"parameter {error}") from None
+
+    def in_use(self, kind: type[Settings]) -> Settings:
+        """The settings as they are now, with defaults in the place of wrong values."""
+        return self._build(kind, {})
 
     def check(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether these values may be set: for add_on_set_parameters_callback."""
