@@ -1,7 +1,17 @@
 """Settings of the algorithms: frozen dataclasses, from which ROS parameters and yaml files are derived."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from typing import Any
+
+# Retired names of settings, and the names that took their place. Whoever still gives one is told.
+RETIRED = {"rejuvenation": "rejuvenated_objects", "reheating": "tempering_steps"}
+
+
+def retirement(name: str, known: Collection[str]) -> str:
+    """What to tell somebody who gives a retired name; empty where it is none, or the new one is not among the known."""
+    new = RETIRED.get(name)
+    return f"this name is retired, use {new}" if new in known else ""
 
 
 def setting(default: Any, description: str, *, unit: str = "", low: Any = None, high: Any = None, choices=()) -> Any:
@@ -91,8 +101,10 @@ class ParserSettings:
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
     ess_threshold: float = setting(0.3, "resample below this fraction of effective particles", low=0.0, high=1.0)
-    rejuvenation: int = setting(1, "objects of a finished scene that are moved again given the others", low=0, high=100)
-    reheating: int = setting(
+    rejuvenated_objects: int = setting(
+        1, "objects of a finished scene that are moved again given the others", low=0, high=100
+    )
+    tempering_steps: int = setting(
         0, "steps by which their posterior is flattened meanwhile, to get from peak to peak", low=0, high=20
     )
     seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from bayes3d_ros.cli.errors import InputError
+from bayes3d_ros.settings import retirement
 
 Settings = TypeVar("Settings")
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -57,6 +58,8 @@ def settings_from(kind: type[Settings], more: tuple[str, ...], options: dict[str
     chosen = {name: value for name, value in options.items() if value is not None}
     for text in more:
         name, _, value = text.partition("=")
+        if retired := retirement(name, kinds):
+            raise InputError(f"--set {text}: {retired}")
         if name not in kinds:
             raise InputError(f"--set {text}: expected one of {', '.join(kinds)}")
         try:

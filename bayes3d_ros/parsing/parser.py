@@ -216,12 +216,12 @@ class SceneParser:
         self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, grid: NoiseGrid
     ) -> smc.Population:
         """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
-        reheating."""
+        tempering."""
         settings = self.settings
-        if count < 2 and not (count and settings.reheating):
+        if count < 2 and not (count and settings.tempering_steps):
             return state
         key = jax.random.fold_in(key, 2000 + count)
-        effort = Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating))
+        effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
         state = smc.refresh(
             key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort
         )

@@ -1,5 +1,6 @@
 """ROS parameters, their descriptors and the yaml files, all derived from the dataclasses of settings."""
 
+import difflib
 import math
 import re
 import sys
@@ -15,9 +16,20 @@ from rclpy.parameter import Parameter
 
 from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.conversions import matrix_from_values
-from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
+from bayes3d_ros.settings import (
+    RETIRED,
+    LearnerSettings,
+    ParserSettings,
+    TrackerSettings,
+    retirement,
+    setting,
+    validate,
+)
 
 Settings = TypeVar("Settings")
+# What rclpy, or a part of it, may declare later, or not in every version.
+_STANDARD_PARAMETERS = {"use_sim_time", "start_type_description_service"}
+_STANDARD_PREFIXES = ("qos_overrides.",)
 
 
 @dataclass(frozen=True)
@@ -121,7 +133,8 @@ class SettingsParameters:
     """Declares the fields of settings dataclasses as a node's parameters, keeps them valid and reads them back.
 
     A value from a file or the command line that is wrong does not stop the node: the default stands in for it and
-    `problems` says of each what is wrong, until that parameter is set again.
+    `problems` says of each what is wrong, until that parameter is set again. So it does of a retired name, until the
+    parameter that took its place is set. A value for a name that no parameter has is a warning in the log.
     """
 
     def __init__(self, node: Node, kinds: tuple[type, ...]) -> None:
@@ -132,6 +145,7 @@ class SettingsParameters:
                 self._declare(field)
         for kind in kinds:
             self._replace_invalid(kind)
+        self._check_names()
 
     def read(self, kind: type[Settings]) -> Settings:
         """The settings as they are now. ValueError with one line naming the parameter."""
@@ -184,6 +198,24 @@ class SettingsParameters:
                     raise
                 self.problems[name] = f"parameter {error}"
                 self._use_default(named[name])
+
+    def _check_names(self) -> None:
+        """Look at the names that files and the command line give values for: rclpy drops those it does not know."""
+        known = {field.name for kind in self._kinds for field in fields(kind)}
+        for name in sorted(self._node._parameter_overrides):
+            if told := retirement(name, known):
+                new = RETIRED[name]
+                earlier = [self.problems[new]] if new in self.problems else []
+                self.problems[new] = "; ".join([*earlier, f"parameter {name}: {told}"])
+            elif not self._is_parameter(name):
+                near = difflib.get_close_matches(name.rpartition(".")[2], known, n=1)
+                hint = f"; the nearest name is {near[0]}" if near else ""
+                log = self._node.get_logger()
+                log.warning(f"parameter {name}: {self._node.get_name()} has none of this name, it is not used{hint}")
+
+    def _is_parameter(self, name: str) -> bool:
+        standard = name in _STANDARD_PARAMETERS or name.startswith(_STANDARD_PREFIXES)
+        return standard or self._node.has_parameter(name)
 
     def _use_default(self, field: Field) -> None:
         if self._node.has_parameter(field.name):

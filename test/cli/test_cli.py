@@ -176,6 +176,7 @@ def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers,
     [
         (["--particles", "0"], "particles"),
         (["--set", "nonsense=1"], "nonsense"),
+        (["--set", "rejuvenation=2"], "--set rejuvenation=2: this name is retired, use rejuvenated_objects"),
         (["--set", "window=wide"], "window=int"),
         (["--set", "window=4"], "odd"),
         (["--set", "far=inf"], "far must lie in"),

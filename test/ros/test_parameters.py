@@ -1,6 +1,7 @@
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -18,7 +19,7 @@ from bayes3d_ros.ros.parameters import (
     describe,
     yaml_text,
 )
-from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.settings import RETIRED, ParserSettings
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +168,53 @@ def test_all_bad_values_at_the_start_are_named_and_each_can_be_set_right_alone(
 @pytest.mark.parametrize("declared", [with_values("near:=6.0", "far:=8.0")], indirect=True)
 def test_values_that_are_right_together_are_taken(declared: tuple[Node, SettingsParameters]) -> None:
     assert declared[1].read(ParserSettings) == ParserSettings(near=6.0, far=8.0)
+
+
+def retired_in(node: str) -> list[str]:
+    known = {f.name for kind in NODE_SETTINGS[node] for f in fields(kind)}
+    return [old for old, new in RETIRED.items() if new in known]
+
+
+def test_retired_names_name_settings_that_there_are() -> None:
+    known = {f.name for kinds in NODE_SETTINGS.values() for kind in kinds for f in fields(kind)}
+    assert set(RETIRED.values()) <= known and not set(RETIRED) & known
+
+
+@pytest.mark.parametrize("from_file", [False, True])
+@pytest.mark.parametrize(("node_name", "old"), [(node, old) for node in NODE_SETTINGS for old in retired_in(node)])
+def test_a_retired_name_is_refused_until_the_new_one_is_set(
+    context: rclpy.Context, tmp_path: Path, node_name: str, old: str, from_file: bool
+) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(f"/**: {{ros__parameters: {{{old}: 2}}}}")
+    given = ["--params-file", str(file)] if from_file else ["-p", f"{old}:=2"]
+    node = Node(node_name, context=context, cli_args=["--ros-args", *given])
+    parameters = SettingsParameters(node, NODE_SETTINGS[node_name])
+    node.add_on_set_parameters_callback(parameters.check)
+    with pytest.raises(ValueError) as error:
+        parameters.read(NODE_SETTINGS[node_name][0])
+    assert str(error.value) == f"parameter {old}: this name is retired, use {RETIRED[old]}"
+    assert node.set_parameters([Parameter(RETIRED[old], value=2)])[0].successful
+    assert getattr(parameters.read(NODE_SETTINGS[node_name][1]), RETIRED[old]) == 2
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("node_name", NODE_SETTINGS)
+def test_a_name_that_no_parameter_has_is_a_warning_with_the_nearest_one(
+    context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, node_name: str
+) -> None:
+    standard = ["use_sim_time:=true", "start_type_description_service:=true", "qos_overrides./tf.history:=keep_all"]
+    words = with_values(*standard, "patience:=1.0", "libary:=objects", "nested.patence:=1.0", "xyzzy:=1")
+    node = Node(node_name, context=context, cli_args=["--ros-args", *words])
+    told: list[str] = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=told.append))
+    SettingsParameters(node, NODE_SETTINGS[node_name])
+    assert told == [
+        f"parameter libary: {node_name} has none of this name, it is not used; the nearest name is library",
+        f"parameter nested.patence: {node_name} has none of this name, it is not used; the nearest name is patience",
+        f"parameter xyzzy: {node_name} has none of this name, it is not used",
+    ]
+    node.destroy_node()
 
 
 def test_a_name_for_an_object_is_checked_when_it_is_set(context: rclpy.Context) -> None:

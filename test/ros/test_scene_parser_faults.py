@@ -21,6 +21,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.diagnostics import ERROR
 
 INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 SECOND = 1_000_000_000
@@ -184,6 +185,20 @@ def test_a_changed_setting_is_checked_and_taken(bench: Bench) -> None:
     assert set_parameter("camera_pose", []).successful
     assert set_parameter("table", "auto").successful
     bench.frames_are_parsed()
+
+
+def test_a_retired_parameter_keeps_the_node_unconfigured_until_the_new_one_is_set(ros, library_folder: Path) -> None:
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    process = ros.start_parser(library_folder, reheating=2)
+    told = "parameter reheating: this name is retired, use tempering_steps"
+    report = ros.wait_for_diagnosis(diagnostics, told)
+    assert report.status[0].level == ERROR and report.status[0].message == told
+    state = ros.call(GetState, "/scene_parser/get_state", GetState.Request()).current_state.label
+    assert state == "unconfigured" and process.output().count(told) == 1
+    request = SetParameters.Request(parameters=[Parameter("tempering_steps", value=2).to_parameter_msg()])
+    assert ros.call(SetParameters, "/scene_parser/set_parameters", request).results[0].successful
+    assert ros.call(Trigger, "/scene_parser/reload_library", Trigger.Request()).success
+    ros.wait_for_diagnosis(diagnostics, "no publisher")
 
 
 def test_a_best_effort_publisher_is_heard(ros, library_folder: Path) -> None:

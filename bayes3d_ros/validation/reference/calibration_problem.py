@@ -42,8 +42,8 @@ SETTINGS = ParserSettings(
     pixel_weight=1.0,  # images are drawn pixel by pixel
     sigma_max=0.004,
     particles=192,
-    rejuvenation=2,
-    reheating=3,
+    rejuvenated_objects=2,
+    tempering_steps=3,
 )
 
 
@@ -191,7 +191,7 @@ def sample(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProblem) -
                 grid,
                 settings.window,
                 settings.ess_threshold,
-                Effort(jnp.int32(settings.rejuvenation), jnp.int32(settings.reheating)),
+                Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps)),
             )
         noise = _sample_noise(jax.random.fold_in(key, 1000 + number), state.loglik_grid, grid)
         log_weight = state.log_weight + state.log_evidence + problem.log_count[number]
