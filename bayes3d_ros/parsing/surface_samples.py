@@ -11,7 +11,7 @@ from bayes3d_ros.objects.placement import Placement, Table
 NEAREST = 0.02  # metres: points nearer to the camera, or behind it, are projected as if they were there
 
 
-class Pixels(NamedTuple):
+class ProjectedPoints(NamedTuple):
     """The pixels that points fall into, the nearest of the image for points outside."""
 
     z: Float[Array, "*n"]  # metres
@@ -20,14 +20,14 @@ class Pixels(NamedTuple):
     inside: Bool[Array, "*n"]
 
 
-def pixels_of(point: Float[Array, "*n 3"], image: ScoredImage) -> Pixels:
+def pixels_of(point: Float[Array, "*n 3"], image: ScoredImage) -> ProjectedPoints:
     """Points are in the camera frame."""
     height, width = image.depth.shape
     z = jnp.maximum(point[..., 2], NEAREST)
     u = jnp.round(point[..., 0] / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
     v = jnp.round(point[..., 1] / z * image.focal[1] + image.centre[1]).astype(jnp.int32)
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    return Pixels(z, jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1), inside)
+    return ProjectedPoints(z, jnp.clip(u, 0, width - 1), jnp.clip(v, 0, height - 1), inside)
 
 
 class SurfaceInCamera(NamedTuple):
