@@ -11,11 +11,10 @@ from bayes3d_ros.geometry.se3 import product
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, log_likelihood, outlier_density
 from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses
-from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.plane import plane_depth
+from bayes3d_ros.likelihood.march import NO_SURFACE, march
+from bayes3d_ros.likelihood.plane import plane_depth, upper_side
 from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
-from bayes3d_ros.likelihood.tiled_render import over_depth
-from bayes3d_ros.likelihood.tiles import tile_size, tiles_of_objects
+from bayes3d_ros.likelihood.tiles import TiledHypotheses, Tiles, over_depth, tile_size, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
@@ -25,14 +24,6 @@ class World(NamedTuple):
     type: Int[Array, "K"]
     T_world_object: Float[Array, "K 4 4"]
     table_visible: Bool[Array, ""]  # whether the plane z = 0 is a surface
-
-
-def table_depth(
-    T_camera_world: Float[Array, "*n 4 4"], x: Float[Array, "*shape"], y: Float[Array, "*shape"]
-) -> Float[Array, "*shape"]:
-    """Depth of the plane z = 0 of the world along rays (x, y, 1), inf where they do not meet its upper side."""
-    normal, origin = T_camera_world[..., :3, 2], T_camera_world[..., :3, 3]
-    return plane_depth([normal[..., a] for a in range(3)], (normal * origin).sum(-1), x, y)
 
 
 @partial(jax.jit, static_argnames="window")
@@ -54,12 +45,12 @@ def log_likelihood_of_cameras(
     count, objects = len(T_camera_world), len(world.type)
     T = product(T_camera_world[:, None], world.T_world_object)
     kinds = jnp.broadcast_to(world.type, (count, objects))
-    covered, scored = (
-        tiles_of_objects(T, kinds, image, library, grown, world.table_visible, size.tile) for grown in (0, half)
-    )
 
     def render(n, rays):
         return depth_along(T_camera_world[n], world, library, rays)
+
+    def tiles(grown: int) -> Tiles:
+        return tiles_of_objects(T, kinds, image, library, grown, world.table_visible, size.tile)
 
     def score(total, n, u, v, depth, real):
         pixels = observed(image, u, v, (size.tile, size.tile))
@@ -68,13 +59,13 @@ def log_likelihood_of_cameras(
         return total.at[n].add(jnp.where(real, value - pixels.weight * alone, 0.0).transpose(2, 0, 1))
 
     start = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_depth(score, start, render, covered, scored, count, image, half, size)
+    return over_depth(score, start, TiledHypotheses(count, render, tiles(0), tiles(half)), image, half, size)
 
 
 def _hypotheses(T_camera_world: Float[Array, "N 4 4"], world: World) -> RenderedHypotheses:
     """The world as every camera sees it."""
-    normal, origin = T_camera_world[:, :3, 2], T_camera_world[:, :3, 3]
-    plane = jnp.concatenate([normal, (normal * origin).sum(-1, keepdims=True)], 1)
+    normal, offset = upper_side(T_camera_world)
+    plane = jnp.concatenate([normal, offset[:, None]], 1)
     return RenderedHypotheses(
         type=jnp.broadcast_to(world.type, (len(T_camera_world), len(world.type))),
         T_camera_object=product(T_camera_world[:, None], world.T_world_object),
@@ -89,9 +80,11 @@ def depth_along(
     library: LibraryArrays,
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
 ) -> Float[Array, "*shape"]:
-    """Depth along rays (x, y, 1) of what cameras there see, inf where nothing is; `n` broadcasts against `shape` from
-    the right."""
-    depth = jnp.where(world.table_visible, table_depth(T_camera_world, *rays), jnp.inf)
+    """Depth along rays (x, y, 1) of what cameras there see, NO_SURFACE where nothing is; `n` broadcasts against `shape`
+    from the right."""
+    normal, offset = upper_side(T_camera_world)
+    table = plane_depth([normal[..., a] for a in range(3)], offset, *rays)
+    depth = jnp.where(world.table_visible, table, NO_SURFACE)
     for k in range(len(world.type)):
         T = product(T_camera_world, world.T_world_object[k])
         depth = jnp.minimum(depth, march(library, world.type[k], T, rays))
@@ -107,4 +100,4 @@ def render_cameras(
     shape = (len(T_camera_world), *image.depth.shape)
     rays = jnp.broadcast_to(image.ray_x, shape), jnp.broadcast_to(image.ray_y[:, None], shape)
     own = jnp.arange(shape[1])[:, None] < image.own_rows
-    return jnp.where(own, depth_along(T_camera_world[:, None, None], world, library, rays), jnp.inf)
+    return jnp.where(own, depth_along(T_camera_world[:, None, None], world, library, rays), NO_SURFACE)

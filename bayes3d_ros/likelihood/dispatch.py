@@ -31,7 +31,7 @@ class Gain(Protocol):
 
 def kernel(image: ScoredImage) -> Gain | None:
     """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
-    tile (`tiled_render.py`): free points, other backends, a CPU whose call frames the kernel cannot read."""
+    tile (`tiles.py`): free points, other backends, a CPU whose call frames the kernel cannot read."""
     if image.likelihood.name != "depth" or image.points is not None:
         return None
     backend = jax.default_backend()

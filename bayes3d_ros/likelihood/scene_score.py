@@ -1,6 +1,5 @@
 """Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change."""
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -10,17 +9,25 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.likelihood.density import Noise, Pixels, log_likelihood
 from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
-from bayes3d_ros.likelihood.march import march
+from bayes3d_ros.likelihood.march import NO_SURFACE, march
 from bayes3d_ros.likelihood.scored_image import ScoredImage, observed
-from bayes3d_ros.likelihood.tiled_render import crop, over_depth, padding, render_tiles
-from bayes3d_ros.likelihood.tiles import LARGE, Tiles, tiles_of_objects
+from bayes3d_ros.likelihood.tiles import (
+    LARGE,
+    TiledHypotheses,
+    Tiles,
+    crop,
+    over_depth,
+    padding,
+    render_tiles,
+    tiles_of_objects,
+)
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 
 
 def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*batch Hp Wp"]:
     pad = [(0, 0)] * (depth.ndim - 2) + [padding(window // 2, LARGE)] * 2
-    return jnp.pad(depth, pad, constant_values=jnp.inf)
+    return jnp.pad(depth, pad, constant_values=NO_SURFACE)
 
 
 def _hypotheses(placement: Placement, library: LibraryArrays, table: Table) -> RenderedHypotheses:
@@ -29,10 +36,9 @@ def _hypotheses(placement: Placement, library: LibraryArrays, table: Table) -> R
     return RenderedHypotheses(placement.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
 
 
-def _rendering(
-    placement: Placement, image: ScoredImage, library: LibraryArrays, table: Table
-) -> tuple[Callable, Callable]:
-    """Renders object n along rays; tiles of the objects' outlines, grown by so many pixels."""
+def _tiled(
+    placement: Placement, image: ScoredImage, library: LibraryArrays, table: Table, half: int
+) -> TiledHypotheses:
     T = T_camera_object(placement, library, table)
 
     def render(n, rays):
@@ -41,7 +47,7 @@ def _rendering(
     def tiles(grown: int) -> Tiles:
         return tiles_of_objects(T[:, None], placement.type[:, None], image, library, grown)
 
-    return render, tiles
+    return TiledHypotheses(len(placement.type), render, tiles(0), tiles(half))
 
 
 def _twice(pixels: Pixels) -> Pixels:
@@ -75,7 +81,6 @@ def log_likelihood_gain(
         hypotheses = _hypotheses(placement, library, table)
         return gain_of(hypotheses, SceneDepths(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
-    render, tiles = _rendering(placement, image, library, table)
 
     def add(gains, n, u, v, depth, real):
         before = crop(scenes, ancestor[n], u, v, tile + 2 * half)
@@ -85,9 +90,9 @@ def log_likelihood_gain(
         gain = value[..., chunk:] - value[..., :chunk]
         return gains.at[n].add(jnp.where(real, gain, 0.0).transpose(2, 0, 1))
 
-    count = len(placement.type)
-    gains = jnp.zeros((count, noise.sigma.shape[0], noise.p_outlier.shape[0]))
-    return over_depth(add, gains, render, tiles(0), tiles(half), count, image, half, LARGE)
+    tiled = _tiled(placement, image, library, table, half)
+    gains = jnp.zeros((tiled.number, noise.sigma.shape[0], noise.p_outlier.shape[0]))
+    return over_depth(add, gains, tiled, image, half)
 
 
 @partial(jax.jit, static_argnames="window")
@@ -102,10 +107,8 @@ def render_objects(
     """Scene n with object n rendered into it."""
     if depth := depth_kernel():
         return depth(_hypotheses(placement, library, table), scenes, image, library, window // 2)
-    render, tiles = _rendering(placement, image, library, table)
-    covered = tiles(0)
-    each = covered.u.shape[0] // len(scenes)
-    return render_tiles(render, scenes, covered, (0, covered.u.shape[0]), each, image, window // 2, LARGE)
+    tiled = _tiled(placement, image, library, table, window // 2)
+    return render_tiles(tiled, (0, tiled.number), scenes, image, window // 2, LARGE)
 
 
 def log_likelihood_scene(

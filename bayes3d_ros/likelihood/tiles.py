@@ -1,7 +1,10 @@
-"""The part of the image that each hypothesis can change, cut into tiles.
+"""The part of the image that each hypothesis can change, cut into tiles; depth rendered and scored tile by tile.
 
 Tiles of all hypotheses form one list, worked through in chunks of static shape, as many as it takes: cost grows with
-the pixels that hypotheses cover.
+the pixels that hypotheses cover. Windows overlap: a tile's neighbours belong to the windows of its pixels too. So each
+hypothesis is rendered once, into an image of its own, and scored from there. The images of a batch fit into a cache,
+those of all would not fit anywhere. `over_depth` is for what the kernels do not do: free points, and backends other
+than CPUs and GPUs.
 """
 
 from collections.abc import Callable
@@ -12,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from bayes3d_ros.likelihood.march import NO_SURFACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
@@ -24,6 +28,7 @@ class TileSize(NamedTuple):
 
 
 LARGE, _SMALL = TileSize(), TileSize(4, 256)
+_BATCH_PIXELS = 1 << 20  # of the images that are rendered at a time
 _SMALL_WIDTH = 64  # pixels across: outlines in images up to here leave large tiles half empty
 
 
@@ -38,6 +43,20 @@ class Tiles(NamedTuple):
     first: Int[Array, "N*R+1"]  # number of tiles in the rows before
     u: Int[Array, "N*R"]  # of the row's first tile
     v: Int[Array, "N*R"]
+
+
+class TiledHypotheses(NamedTuple):
+    """N hypotheses that are rendered and scored by tiles of their own."""
+
+    number: int
+    render: Callable  # render(n, rays): depth of hypotheses n along rays (x, y, 1) of shape [h, w, chunk]
+    covered: Tiles  # in which a hypothesis may have a surface
+    scored: Tiles  # those, and around them what has such a tile in its pixels' windows
+
+    @property
+    def rows_each(self) -> int:
+        """Rows of tiles of every hypothesis."""
+        return self.covered.u.shape[0] // self.number
 
 
 # The corners of a box that differ in one coordinate: its twelve edges.
@@ -111,3 +130,66 @@ def over_tiles(work: Callable, carry, tiles: Tiles, rows: tuple[Array | int, Arr
         return start + size.chunk, work(carry, row // each, u, tiles.v[row], real)
 
     return jax.lax.while_loop(lambda state: state[0] < end, do_chunk, (begin, carry))[1]
+
+
+def padding(half: int, size: TileSize) -> tuple[int, int]:
+    """Pixels of padding before and after an image, so that every tile with its window, of which this is half, lies
+    inside."""
+    return half, half + size.tile
+
+
+def render_tiles(
+    hypotheses: TiledHypotheses,
+    numbers: tuple[Array | int, Array | int],
+    images: Float[Array, "B Hp Wp"],
+    image: ScoredImage,
+    half: int,
+    size: TileSize,
+) -> Float[Array, "B Hp Wp"]:
+    """Hypotheses [first, past) rendered into padded images, one each, where they are nearer than what is there."""
+    height, width = image.own_rows, image.depth.shape[1]
+    step = jnp.arange(size.tile)[:, None]
+    first, each = numbers[0], hypotheses.rows_each
+
+    def put(images, n, u, v, real):
+        column, row = u + step, (v + step)[:, None]
+        shape = (size.tile, size.tile, size.chunk)
+        x = jnp.broadcast_to((column - image.centre[0]) / image.focal[0], shape)
+        y = jnp.broadcast_to((row - image.centre[1]) / image.focal[1], shape)
+        inside = real & (row < height) & (column < width)  # the image ends at its rim
+        index = jnp.where(real, n - first, len(images))
+        depth = jnp.where(inside, hypotheses.render(n, (x, y)), NO_SURFACE)
+        return images.at[index, half + row, half + column].min(depth, mode="drop")
+
+    return over_tiles(put, images, hypotheses.covered, (first * each, numbers[1] * each), each, size)
+
+
+def crop(images: Float[Array, "B Hp Wp"], index, u, v, side: int) -> Float[Array, "side side T"]:
+    """Square crops of padded images; (u, v) are pixels of the unpadded image, the crop starts half a window before."""
+    step = jnp.arange(side)[:, None]
+    # Fused with what is made of it, a gather would be repeated for every pixel of a window, and not vectorised.
+    return jax.lax.optimization_barrier(images[index, (v + step)[:, None], u + step])
+
+
+def over_depth(
+    score: Callable, carry, hypotheses: TiledHypotheses, image: ScoredImage, half: int, size: TileSize = LARGE
+):
+    """carry = score(carry, hypothesis, u, v, depth, real) over the tiles to be scored, depth with a border of half a
+    window around."""
+    shape = tuple(side + sum(padding(half, size)) for side in image.depth.shape)
+    count, each = hypotheses.number, hypotheses.rows_each
+    batch = max(1, min(count, _BATCH_PIXELS // (shape[0] * shape[1])))
+    side = size.tile + 2 * half
+
+    def one_batch(number: Int[Array, ""], carry):
+        first = number * batch
+        past = jnp.minimum(first + batch, count)
+        images = jnp.full((batch, *shape), NO_SURFACE)
+        images = render_tiles(hypotheses, (first, past), images, image, half, size)
+
+        def look(carry, n, u, v, real):
+            return score(carry, n, u, v, crop(images, jnp.minimum(n - first, batch - 1), u, v, side), real)
+
+        return over_tiles(look, carry, hypotheses.scored, (first * each, past * each), each, size)
+
+    return jax.lax.fori_loop(0, -(-count // batch), one_batch, carry)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood import camera_score
-from bayes3d_ros.likelihood.camera_score import World, depth_along, log_likelihood_of_cameras, table_depth
+from bayes3d_ros.likelihood.camera_score import World, depth_along, log_likelihood_of_cameras
 from bayes3d_ros.likelihood.cpu.gain import compiled_gain
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
+from bayes3d_ros.likelihood.plane import plane_depth, upper_side
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 
@@ -104,12 +105,12 @@ def test_scores_are_those_of_whole_images(name, kernel, cameras, image, arrays):
 
 
 def test_the_table_is_the_plane_of_the_world(cameras):
-    """Points met lie in z = 0 of the world, and what a ray does not meet is inf."""
+    """Points met lie in z = 0 of the world, and a ray that does not meet it has no surface."""
     x, y = rays()
-    depth = np.asarray(table_depth(cameras[0], x, y))
+    depth = np.asarray(plane_depth(*upper_side(cameras[0]), x, y))
     met = np.isfinite(depth)
     assert met.sum() > 500
     points = np.stack([x * depth, y * depth, depth], -1)[met]
     local = (points - np.asarray(cameras[0])[:3, 3]) @ np.asarray(cameras[0])[:3, :3]
     np.testing.assert_allclose(local[:, 2], 0, atol=1e-5)
-    assert not np.isfinite(table_depth(cameras[-3], x, y)).any()  # looks away
+    assert not np.isfinite(plane_depth(*upper_side(cameras[-3]), x, y)).any()  # looks away
