@@ -5,7 +5,7 @@ to interpolate, and far too coarse to sum.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -27,25 +27,6 @@ _PARTS = 5  # of a fine step, in which noise is sampled
 _DENSE = 4  # sigmas of a reference scene in a coarse step
 
 
-def _spline(points: int, places: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K N"]:
-    """Carries values on an axis 0, 1, .. to places on it."""
-    return CubicSpline(np.arange(points), np.eye(points))(places).astype(np.float32)
-
-
-def _parts(coarse: int, fine: int) -> Float[np.ndarray, "K"]:
-    """The middles of parts of the fine steps, on an axis whose coarse points are 0, 1, .."""
-    count = (coarse - 1) * fine * _PARTS
-    return (np.arange(count) + 0.5) * (coarse - 1) / count
-
-
-_TO_SIGMA_PARTS = _spline(_SIGMA_STEPS, _parts(_SIGMA_STEPS, _SIGMA_FINE))
-_TO_P_PARTS = _spline(_P_STEPS, _parts(_P_STEPS, _P_FINE))
-_DENSE_STEPS = (_SIGMA_STEPS - 1) * _DENSE + 1
-_TO_DENSE = _spline(_SIGMA_STEPS, np.arange(_DENSE_STEPS) / _DENSE)
-_DENSE_TO_FINE = _spline(_DENSE_STEPS, np.arange((_SIGMA_STEPS - 1) * _SIGMA_FINE + 1) * _DENSE / _SIGMA_FINE)
-_DENSE_TO_PARTS = _spline(_DENSE_STEPS, _parts(_SIGMA_STEPS, _SIGMA_FINE) * _DENSE)
-
-
 class NoiseGrid(NamedTuple):
     """The coarse grid, the fine one, and what carries values from one to the other."""
 
@@ -60,13 +41,54 @@ class NoiseGrid(NamedTuple):
     sigma_error_parts: Float[Array, "K P"]  # the same at the parts of the fine steps
 
 
+class _Splines(NamedTuple):
+    """Matrices that carry values on the coarse points of a whole grid's axis, or on the dense points of its sigmas, to
+    other places on the axis."""
+
+    to_sigma_parts: Float[np.ndarray, "K S"]
+    to_p_parts: Float[np.ndarray, "L P"]
+    to_dense: Float[np.ndarray, "D S"]
+    dense_to_fine: Float[np.ndarray, "Sf D"]
+    dense_to_parts: Float[np.ndarray, "K D"]
+
+
+def _splines(grid: NoiseGrid) -> _Splines:
+    """Those that belong to a grid: the sizes of its arrays tell how many coarse and fine points it has."""
+    sigmas, p_outliers = (len(axis) for axis in grid.coarse)
+    fine = [(len(axis) - 1) // (count - 1) for axis, count in zip(grid.fine, (sigmas, p_outliers), strict=True)]
+    return _splines_of_sizes(sigmas, p_outliers, *fine)
+
+
+@cache
+def _splines_of_sizes(sigmas: int, p_outliers: int, fine_sigma: int, fine_p: int) -> _Splines:
+    dense = (sigmas - 1) * _DENSE + 1
+    return _Splines(
+        to_sigma_parts=_spline(sigmas, _parts(sigmas, fine_sigma)),
+        to_p_parts=_spline(p_outliers, _parts(p_outliers, fine_p)),
+        to_dense=_spline(sigmas, np.arange(dense) / _DENSE),
+        dense_to_fine=_spline(dense, np.arange((sigmas - 1) * fine_sigma + 1) * _DENSE / fine_sigma),
+        dense_to_parts=_spline(dense, _parts(sigmas, fine_sigma) * _DENSE),
+    )
+
+
+def _spline(points: int, places: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K N"]:
+    """Carries values on an axis 0, 1, .. to places on it."""
+    return CubicSpline(np.arange(points), np.eye(points))(places).astype(np.float32)
+
+
+def _parts(coarse: int, fine: int) -> Float[np.ndarray, "K"]:
+    """The middles of parts of the fine steps, on an axis whose coarse points are 0, 1, .."""
+    count = (coarse - 1) * fine * _PARTS
+    return (np.arange(count) + 0.5) * (coarse - 1) / count
+
+
 def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE)) -> NoiseGrid:
     """sigma ~ U(0, sigma_max) and p_outlier ~ U(0, 1), both proper; the mass below the grid's ends is left out.
 
     Each return's log(p a + (1 - p) b) is log(a e^v + b) + log(1 - p), v = logit p: the first term is nearly straight in
     v where a return is clearly the one or the other, the second bends and is known. So what splines make of it is taken
     out again, times the number of returns (`for_returns`); none as it comes from here. `fine`: points of sigma and of
-    p_outlier between coarse ones; `for_image` and `sample` expect the default.
+    p_outlier between coarse ones.
     """
     u = np.log(sigma_max) - np.log(2) / 3 * np.arange(_SIGMA_STEPS)[::-1]
     v = np.linspace(_logit(_P_LOW), _logit(_P_HIGH), _P_STEPS)
@@ -75,6 +97,7 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
     p_fine = 1 / (1 + np.exp(-v_fine))
     mass_sigma = np.exp(u_fine) / sigma_max * _trapezoid(u_fine)
     mass_p = p_fine * (1 - p_fine) * _trapezoid(v_fine)
+    parts = len(_parts(len(u), fine[0]))
     return NoiseGrid(
         coarse=Noise(jnp.float32(np.exp(u)), jnp.float32(1 / (1 + np.exp(-v)))),
         fine=Noise(jnp.float32(np.exp(u_fine)), jnp.float32(p_fine)),
@@ -84,7 +107,7 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
         p_error=jnp.float32(CubicSpline(v, -np.logaddexp(0, v))(v_fine) + np.logaddexp(0, v_fine)),
         returns=jnp.float32(0),
         sigma_error=jnp.zeros((len(u_fine), len(v)), jnp.float32),
-        sigma_error_parts=jnp.zeros((len(_DENSE_TO_PARTS), len(v)), jnp.float32),
+        sigma_error_parts=jnp.zeros((parts, len(v)), jnp.float32),
     )
 
 
@@ -106,15 +129,16 @@ def for_image(grid: NoiseGrid, image: ScoredImage, window: int) -> NoiseGrid:
     returns do so alike in every scene, so the empty table is a reference: its log likelihood at four times as many
     sigmas tells what splines make of every scene's.
     """
+    splines = _splines(grid)
     ends = jnp.log(grid.coarse.sigma[0]), jnp.log(grid.coarse.sigma[-1])
-    dense = Noise(jnp.exp(jnp.linspace(*ends, _DENSE_STEPS)), grid.coarse.p_outlier)
+    dense = Noise(jnp.exp(jnp.linspace(*ends, len(splines.to_dense))), grid.coarse.p_outlier)
     loglik_grid = log_likelihood_scene(pad_scene(image.bare_depth, window)[None], image, dense, window)[0]
     loglik_grid = loglik_grid - loglik_grid.max()
     exact = jax.lax.Precision.HIGHEST
-    error = loglik_grid - jnp.einsum("rs,sp->rp", jnp.asarray(_TO_DENSE), loglik_grid[::_DENSE], precision=exact)
+    error = loglik_grid - jnp.einsum("rs,sp->rp", jnp.asarray(splines.to_dense), loglik_grid[::_DENSE], precision=exact)
     return for_returns(grid, image.pixel_class, image.weight)._replace(
-        sigma_error=jnp.einsum("fr,rp->fp", jnp.asarray(_DENSE_TO_FINE), error, precision=exact),
-        sigma_error_parts=jnp.einsum("kr,rp->kp", jnp.asarray(_DENSE_TO_PARTS), error, precision=exact),
+        sigma_error=jnp.einsum("fr,rp->fp", jnp.asarray(splines.dense_to_fine), error, precision=exact),
+        sigma_error_parts=jnp.einsum("kr,rp->kp", jnp.asarray(splines.dense_to_parts), error, precision=exact),
     )
 
 
@@ -131,8 +155,9 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
 def near_peak(loglik_grid: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -> NoiseGrid:
     """The part of the grid, `count` coarse sigmas, about the best sigma of these log likelihoods: at a
     fraction of the cost, and what is left out has no mass where that sigma is near those of the scenes to come."""
-    first = jnp.clip(jnp.argmax(loglik_grid.max(1)) - count // 2, 0, _SIGMA_STEPS - count)
-    fine = (len(grid.fine.sigma) - 1) // (_SIGMA_STEPS - 1)
+    sigmas = len(grid.coarse.sigma)
+    first = jnp.clip(jnp.argmax(loglik_grid.max(1)) - count // 2, 0, sigmas - count)
+    fine = (len(grid.fine.sigma) - 1) // (sigmas - 1)
     rows = (count - 1) * fine + 1
     part = jax.lax.dynamic_slice_in_dim
     return NoiseGrid(
@@ -174,6 +199,7 @@ def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGri
     then sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough
     to sum, but its step can be wider than a standard deviation of p_outlier: sampled evenly from it, 50 % intervals
     hold 58 %."""
+    splines = _splines(grid)
     s_key, p_key, sigma_key = jax.random.split(key, 3)
     s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(loglik_grid, grid), -1))
     exact = jax.lax.Precision.HIGHEST
@@ -185,13 +211,13 @@ def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGri
         p_key,
         given_sigma + grid.returns * jax.nn.softplus(ends_v),
         ends_v,
-        _TO_P_PARTS,
+        splines.to_p_parts,
         lambda v: -(1 + grid.returns) * jax.nn.softplus(v) - jax.nn.softplus(-v),
     )
-    to_p = jnp.asarray(_TO_P_PARTS)[part]
+    to_p = jnp.asarray(splines.to_p_parts)[part]
     given_p = jnp.einsum("np,nsp->ns", to_p, relative, precision=exact)
     missed = jnp.einsum("np,kp->nk", to_p, grid.sigma_error_parts, precision=exact)
-    _, u = _sample_along(sigma_key, given_p, ends_u, _TO_SIGMA_PARTS, lambda u: u + missed)
+    _, u = _sample_along(sigma_key, given_p, ends_u, splines.to_sigma_parts, lambda u: u + missed)
     return Noise(jnp.exp(u), jax.nn.sigmoid(v))
 
 

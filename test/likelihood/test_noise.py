@@ -7,7 +7,7 @@ import pytest
 from scipy.special import expit, logsumexp
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
-from bayes3d_ros.likelihood.noise import for_returns, log_marginal, noise_grid, peak, sample
+from bayes3d_ros.likelihood.noise import _splines, for_returns, log_marginal, noise_grid, peak, sample
 
 SIGMA_MAX = 0.005
 LOG_SIGMA = np.log(SIGMA_MAX / 10), np.log(SIGMA_MAX)
@@ -144,3 +144,20 @@ def test_peak_is_the_best_of_the_coarse_grid(grid):
     assert best.sigma.shape == best.p_outlier.shape == (1,)
     assert float(best.sigma[0]) == float(grid.coarse.sigma[s]) and abs(np.log(float(best.sigma[0]) / 0.002)) < 0.2
     assert float(best.p_outlier[0]) == float(grid.coarse.p_outlier[q])
+
+
+@pytest.mark.parametrize("fine", [(24, 12), (6, 4)])
+def test_splines_are_those_of_the_grid(fine):
+    """They carry the axis itself to the grid's own fine points, and to middles of parts of its fine steps."""
+    grid = noise_grid(SIGMA_MAX, fine)
+    splines, u, v = _splines(grid), np.log(grid.coarse.sigma), _logit(grid.coarse.p_outlier)
+    dense = splines.to_dense @ u
+    np.testing.assert_allclose(splines.dense_to_fine @ dense, np.log(grid.fine.sigma), atol=1e-5)
+    for parts, axis, fine_axis in [
+        (splines.to_sigma_parts @ u, u, np.log(grid.fine.sigma)),
+        (splines.to_p_parts @ v, v, _logit(grid.fine.p_outlier)),
+    ]:
+        count = 5 * (len(fine_axis) - 1)
+        np.testing.assert_allclose(parts, axis[0] + (axis[-1] - axis[0]) * (np.arange(count) + 0.5) / count, atol=1e-4)
+    assert grid.sigma_error_parts.shape == (len(splines.dense_to_parts), len(v))
+    np.testing.assert_allclose(splines.dense_to_parts @ dense, splines.to_sigma_parts @ u, atol=1e-4)
