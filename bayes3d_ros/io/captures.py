@@ -1,11 +1,11 @@
 """Depth views on disk, one file each: what the object learner keeps until it is told to build."""
 
-import os
-import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from bayes3d_ros.files.atomic import remove_leftovers, write_whole
 from bayes3d_ros.files.npz_file import read_arrays
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
@@ -30,26 +30,18 @@ class CaptureStore:
         assert frame.T_table_camera is not None
         i = frame.intrinsics
         path = self.folder / f"{frame.stamp_ns:020d}.npz"
-        temporary = None
+        arrays: dict[str, Any] = {
+            "depth": np.asarray(frame.depth, np.float32),
+            "intrinsics": np.array([i.fx, i.fy, i.cx, i.cy]),
+            "stamp_ns": np.int64(frame.stamp_ns),
+            "frame_id": np.frombuffer(frame.frame_id.encode(), np.uint8),
+            "T_table_camera": np.asarray(frame.T_table_camera, np.float64),
+        }
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(prefix=".capture-", suffix=".tmp", dir=self.folder)
-            with os.fdopen(handle, "wb") as file:
-                np.savez(  # as it is: compressing took several times as long as the disk
-                    file,
-                    depth=np.asarray(frame.depth, np.float32),
-                    intrinsics=np.array([i.fx, i.fy, i.cx, i.cy]),
-                    stamp_ns=np.int64(frame.stamp_ns),
-                    frame_id=np.frombuffer(frame.frame_id.encode(), np.uint8),
-                    T_table_camera=np.asarray(frame.T_table_camera, np.float64),
-                )
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-            _sync_folder(self.folder)
+            # As it is: compressing took several times as long as the disk.
+            write_whole(path, lambda file: np.savez(file, **arrays), mode=0o600)
         except OSError as error:
-            if temporary is not None:
-                Path(temporary).unlink(missing_ok=True)
             raise CaptureError(f"{path}: cannot write the capture: {error.strerror or error}") from None
         return path
 
@@ -69,8 +61,7 @@ class CaptureStore:
         try:
             for path in paths:
                 path.unlink()
-            for leftover in self.folder.glob(".capture-*.tmp"):  # of a process that was killed
-                leftover.unlink(missing_ok=True)
+            remove_leftovers(self.folder, "*.npz")
         except OSError as error:
             raise CaptureError(f"{error.filename}: cannot delete the capture: {error.strerror}") from None
         return len(paths)
@@ -85,12 +76,3 @@ def _read(path: Path) -> DepthFrame:
         raise ValueError("its arrays have wrong shapes or values")
     height, width = depth.shape
     return DepthFrame(depth, Intrinsics(fx, fy, cx, cy, width, height), stamp, frame_id, pose)
-
-
-def _sync_folder(folder: Path) -> None:
-    """So that the file's name, too, outlives a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -1,18 +1,18 @@
 """Files of a parsed recording: scenes.jsonl, samples.npz and frames/STAMP_NS.npz (docs/outputs.md describes them)."""
 
 import json
-import os
 import re
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float
 from numpy.lib import format as npy
 
+from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
 
@@ -97,15 +97,12 @@ class ResultsWriter:
         """Append a frame; depth is what was parsed, in metres. Returns where its PNG belongs. Raises OSError."""
         try:
             path = self.folder / FRAMES / f"{self._frame_name(posterior.stamp_ns)}.npz"
-            temporary = path.with_name(f".{path.name}.tmp")
-            with temporary.open("wb") as file:
-                np.savez_compressed(
-                    file,
-                    depth=np.asarray(depth, np.float32),
-                    reconstruction=np.asarray(posterior.reconstruction, np.float32),
-                    segmentation=np.asarray(posterior.segmentation, np.uint16),
-                )
-            os.replace(temporary, path)
+            images: dict[str, Any] = {
+                "depth": np.asarray(depth, np.float32),
+                "reconstruction": np.asarray(posterior.reconstruction, np.float32),
+                "segmentation": np.asarray(posterior.segmentation, np.uint16),
+            }
+            write_whole(path, lambda file: np.savez_compressed(file, **images))
             rows = posterior_rows(posterior.samples, posterior.object_index)
             framed = np.zeros(len(rows), _ROW)
             for name, _ in POSTERIOR_FIELDS:
@@ -129,16 +126,17 @@ class ResultsWriter:
         self._scenes.close()
         self._rows.flush()
         rows = np.memmap(self._rows, _ROW, "r") if self._rows.tell() else np.zeros(0, _ROW)
-        temporary = self.folder / f".{SAMPLES}.tmp"
-        # Column by column: a long recording's samples need not fit into memory.
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            columns = {name: rows[name] for name in _ROW.names or ()} | {"types": np.array(self.types, "U")}
-            for name, column in columns.items():
-                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
-                    npy.write_array(file, np.ascontiguousarray(column), allow_pickle=False)
-        os.replace(temporary, self.folder / SAMPLES)
+        write_whole(self.folder / SAMPLES, lambda file: self._write_samples(file, rows))
         self._rows.close()
         Path(self._rows.name).unlink()
+
+    def _write_samples(self, file: BinaryIO, rows: np.ndarray) -> None:
+        """Column by column: a long recording's samples need not fit into memory."""
+        columns = {name: rows[name] for name in _ROW.names or ()} | {"types": np.array(self.types, "U")}
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, column in columns.items():
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
+                    npy.write_array(entry, np.ascontiguousarray(column), allow_pickle=False)
 
 
 _ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])

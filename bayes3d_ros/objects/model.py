@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.files.npz_file import read_arrays
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
 
@@ -181,30 +181,12 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
     path = model_path(folder, model.name)
-    handle, temporary = tempfile.mkstemp(prefix=f".{model.name}-", suffix=".tmp", dir=folder)
     try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, **arrays)
-        os.chmod(temporary, 0o644)
-        if replace:
-            os.replace(temporary, path)
-        else:
-            _move_to_new(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
-    return path
-
-
-def _move_to_new(temporary: str, path: Path) -> None:
-    """Give a file its name, unless that is taken: a rename would replace what another process has just written."""
-    try:
-        os.link(temporary, path)
+        write_whole(path, lambda file: np.savez_compressed(file, **arrays), mode=0o644, replace=replace)
     except FileExistsError:
-        refuse_existing(path.parent, path.stem)
+        refuse_existing(folder, model.name)
         raise
-    except OSError:  # a file system without hard links
-        refuse_existing(path.parent, path.stem)
-        os.replace(temporary, path)
+    return path
 
 
 def _offset_step(voxel_size: float) -> float:

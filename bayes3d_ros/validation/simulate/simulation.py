@@ -1,6 +1,5 @@
 """Depth recordings of simulated scenes: MuJoCo ray casting of meshes, then a depth camera's noise, into a bag."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bayes3d_ros.files.atomic import write_json
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import BagWriter
 from bayes3d_ros.validation.simulate.correlated_errors import draw_correlated_errors
@@ -79,7 +79,7 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
     }
     if any(scene.pose_noise):
         record["pose_noise"] = list(scene.pose_noise)  # metres, radians: the bag's camera poses are wrong by this
-    (out / "ground_truth.json").write_text(json.dumps(record, indent=1) + "\n")
+    write_json(out / "ground_truth.json", record)
     return out
 
 
