@@ -23,7 +23,7 @@ from bayes3d_ros.cli.progress import progress
 def import_meshes(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: float, replace: bool) -> None:
     """Make object models from meshes in metres; a model is named after its file. All or none are written."""
     from bayes3d_ros.objects.mesh_import import make_models
-    from bayes3d_ros.objects.model import save_model
+    from bayes3d_ros.objects.store import save_model
 
     models = make_models(meshes, library, voxel_size, scale=scale, replace=replace)
     for made in list(progress(models, len(meshes), "mesh")):

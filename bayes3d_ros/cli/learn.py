@@ -35,7 +35,7 @@ def learn(
     from bayes3d_ros.io.model_plot import plot_model
     from bayes3d_ros.learning.learn import check_name, spread_views
     from bayes3d_ros.learning.learn import learn as learn_model
-    from bayes3d_ros.objects.model import refuse_existing, save_model
+    from bayes3d_ros.objects.store import refuse_existing, save_model
     from bayes3d_ros.settings import LearnerSettings
 
     check_name(name)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
 def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
     """Parse every depth frame of BAG into a posterior over scenes."""
     from bayes3d_ros.io.bags import read_frames
-    from bayes3d_ros.objects.model import load_library
+    from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.settings import ParserSettings
 
     settings = settings_from(ParserSettings, more, options)

@@ -28,7 +28,7 @@ def track(
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.tracking_results import PICTURE, TrackWriter, plot_track
     from bayes3d_ros.jax_runtime import enable_cache, every_core
-    from bayes3d_ros.objects.model import load_library
+    from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.parsing.parser import SceneParser
     from bayes3d_ros.posterior.types import ParseError
     from bayes3d_ros.settings import TrackerSettings

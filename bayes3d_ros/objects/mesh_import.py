@@ -18,15 +18,8 @@ from bayes3d_ros.geometry.mesh import (
     size_warning,
 )
 from bayes3d_ros.geometry.voxels import voxelize
-from bayes3d_ros.objects.model import (
-    NAME_PATTERN,
-    LibraryError,
-    ObjectModel,
-    load_model,
-    model_path,
-    refuse_existing,
-    save_model,
-)
+from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel
+from bayes3d_ros.objects.store import load_model, model_path, refuse_existing, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it

@@ -23,7 +23,8 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.plots import plot_scene
 from bayes3d_ros.objects.mesh_import import import_meshes
-from bayes3d_ros.objects.model import Library, load_library
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.conversions import matrix_from_values

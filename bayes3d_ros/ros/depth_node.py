@@ -17,7 +17,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.jax_runtime import enable_cache
-from bayes3d_ros.objects.model import Library, load_library
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import Health, InputView, judge, one_line
 from bayes3d_ros.ros.parameters import DepthInputSettings, SettingsParameters

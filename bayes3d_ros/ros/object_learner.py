@@ -25,7 +25,8 @@ from bayes3d_ros.learning.learn import (
     new_share,
 )
 from bayes3d_ros.learning.segment import Thing, ViewError, segment
-from bayes3d_ros.objects.model import LibraryError, learned_from, load_model, model_path, refuse_existing, save_model
+from bayes3d_ros.objects.model import LibraryError
+from bayes3d_ros.objects.store import learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthMessages

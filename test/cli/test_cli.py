@@ -18,7 +18,7 @@ from bayes3d_ros.cli import main, progress
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
 from bayes3d_ros.io.bags import BagWriter, read_frames
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import load_library, save_model
+from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.parsing import parser
 from bayes3d_ros.posterior.types import ParseError, usable_note
 from bayes3d_ros.resources import share_directory

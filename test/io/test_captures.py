@@ -14,7 +14,7 @@ import pytest
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.captures import CaptureError, CaptureStore
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 
 
 def frame(k: int, size: tuple[int, int] = (64, 48)) -> DepthFrame:
@@ -81,7 +81,7 @@ import sys
 from pathlib import Path
 import trimesh
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import save_model
+from bayes3d_ros.objects.store import save_model
 models = [model_from_mesh(trimesh.creation.box((0.1, 0.1, 0.1 + 0.02 * k)), "mug", 0.004) for k in range(2)]
 for k in range(10_000):
     save_model(models[k % 2], Path(sys.argv[2]), replace=True)

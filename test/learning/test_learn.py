@@ -12,7 +12,7 @@ from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.learning.learn import LearningError, learn, spread_views
 from bayes3d_ros.learning.segment import ViewError, middle, segment
-from bayes3d_ros.objects.model import load_model, save_model
+from bayes3d_ros.objects.store import load_model, save_model
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import LearnerSettings
 from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors

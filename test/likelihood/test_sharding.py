@@ -10,7 +10,7 @@ SCORES = """
 import json, jax, jax.numpy as jnp, numpy as np, trimesh
 from bayes3d_ros.validation.bench import kernel_speed
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import save_model
+from bayes3d_ros.objects.store import save_model
 from bayes3d_ros.likelihood.sharding import over_devices
 import sys, pathlib
 folder = pathlib.Path(sys.argv[1])

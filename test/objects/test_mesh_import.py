@@ -8,7 +8,8 @@ import trimesh
 
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.objects.mesh_import import import_meshes, model_from_mesh
-from bayes3d_ros.objects.model import LibraryError, load_library, load_model, save_model
+from bayes3d_ros.objects.model import LibraryError
+from bayes3d_ros.objects.store import load_library, load_model, save_model
 
 TURN = trimesh.transformations.rotation_matrix(0.4, [1, 2, 3], [0.1, 0, 0])
 YCB_DOWN = [

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import LibraryError, load_library, load_model, refuse_existing, save_model
+from bayes3d_ros.objects.model import LibraryError
+from bayes3d_ros.objects.store import load_library, load_model, refuse_existing, save_model
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.likelihood import scored_image
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.objects.library_arrays import library_arrays
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.parsing.reconstruction import render_scene
 from bayes3d_ros.posterior.types import FEWEST_USABLE

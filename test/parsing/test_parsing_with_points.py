@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import ParserSettings

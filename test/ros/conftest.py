@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import load_library, save_model
+from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.ros.conversions import image_message, ns_to_stamp
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
 

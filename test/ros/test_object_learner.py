@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import load_library, save_model
+from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import conversions
 

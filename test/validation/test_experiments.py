@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.cli import main
 from bayes3d_ros.io.bags import BagError, BagWriter
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import Library, save_model
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import save_model
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError
 from bayes3d_ros.validation import experiments
 from bayes3d_ros.validation.experiments import parsing, repeatability

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import save_model
+from bayes3d_ros.objects.store import save_model
 from bayes3d_ros.validation.bench import kernel_speed, peers
 
 BOX = (0.05, 0.04, 0.12)

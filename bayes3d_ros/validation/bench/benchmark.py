@@ -20,7 +20,8 @@ from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.jax_runtime import cores, enable_cache
 from bayes3d_ros.objects.mesh_import import DEFAULT_VOXEL_SIZE, import_meshes
-from bayes3d_ros.objects.model import Library, load_library
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.validation.bench.speed_rows import FILLED_TABLE, SpeedRow, speed_row

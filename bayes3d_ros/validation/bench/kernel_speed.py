@@ -25,7 +25,7 @@ from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.sharding import on_all, over_devices
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.validation.bench import peers
 from bayes3d_ros.validation.bench.benchmark import ycb_library, ycb_mesh
 from bayes3d_ros.validation.bench.speed_rows import SpeedRow, speed_row

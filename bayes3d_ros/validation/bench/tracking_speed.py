@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.validation.bench.benchmark import ycb_library
 from bayes3d_ros.validation.bench.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.validation.experiments.camera_tracking import OBJECTS, Recordings, track_row

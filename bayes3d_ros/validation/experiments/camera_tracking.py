@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.plots import INK, colour
-from bayes3d_ros.objects.model import Library, ObjectModel, load_library
+from bayes3d_ros.objects.model import Library, ObjectModel
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import KnownWorld
 from bayes3d_ros.tracking.tracker import CameraTracker

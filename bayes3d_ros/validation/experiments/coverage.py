@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.objects.model import Library, ObjectModel, load_library
+from bayes3d_ros.objects.model import Library, ObjectModel
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
 from bayes3d_ros.settings import ParserSettings

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.plots import INK, colour
-from bayes3d_ros.objects.model import load_library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory

@@ -17,7 +17,8 @@ from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.learning.learn import Learned, learn
-from bayes3d_ros.objects.model import Library, load_library, save_model
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.settings import LearnerSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_mesh

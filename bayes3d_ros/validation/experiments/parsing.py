@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.objects.model import Library, load_library
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior
 from bayes3d_ros.resources import share_directory
