@@ -1,13 +1,14 @@
 """bag_player BAG: publish a recorded bag's messages as they were recorded, for machines without rosbag2."""
 
-import argparse
 import importlib
+import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import click
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -34,7 +35,7 @@ class BagPlayer(Node):
     A player in a namespace (-r __ns:=/left) publishes in it: recorded /depth/image_rect as /left/depth/image_rect.
     """
 
-    def __init__(self, bag: Path, only: list[str], clock: bool) -> None:
+    def __init__(self, bag: Path, only: Collection[str], clock: bool) -> None:
         super().__init__("bag_player")
         self._bag = bag
         self._executor = SingleThreadedExecutor()
@@ -135,65 +136,85 @@ def message_class(msgtype: str) -> Any:
         raise ImportError(f"{package}.msg has no {name}") from None
 
 
-class _Arguments(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+class _Number(click.ParamType):
+    """A finite number that `fits`; anything else is told as `expected`."""
 
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+    name = "number"
 
+    def __init__(self, expected: str, fits: Callable[[float], bool]) -> None:
+        self._expected, self._fits = expected, fits
 
-def _arguments(argv: list[str]) -> argparse.Namespace:
-    parser = _Arguments(prog="bag_player", description=__doc__)
-    parser.add_argument("bag", type=Path, help="rosbag2 folder with MCAP storage, or an .mcap file")
-    parser.add_argument("--rate", type=_positive, default=1.0, help="times the recorded speed")
-    parser.add_argument("--loop", action="store_true", help="start again at the end; stamps go backwards then")
-    parser.add_argument("--clock", action="store_true", help="publish /clock, for nodes with use_sim_time")
-    parser.add_argument("--wait", type=_seconds, default=1.0, help="seconds to wait for a subscriber on every topic")
-    parser.add_argument("--wait-for", default="", metavar="NODE", help="wait for this node's subscriptions instead")
-    parser.add_argument("--topics", nargs="+", default=[], help="play only these")
-    return parser.parse_args(argv)
-
-
-def _positive(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
-    return value
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        name = param.opts[0] if param is not None else self.name
+        try:
+            number = float(value)
+        except ValueError:
+            raise click.UsageError(f"argument {name}: expected a number, got {value}", ctx) from None
+        if not (math.isfinite(number) and self._fits(number)):
+            raise click.UsageError(f"argument {name}: expected {self._expected}, got {value}", ctx)
+        return number
 
 
-def _seconds(text: str) -> float:
-    value = _number(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number of seconds >= 0, got {text}")
-    return value
+class _SeveralTopics(click.Command):
+    """Takes several words after --topics, which click does not: an option of its own is made of each."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        words: list[str] = []
+        taking = False
+        for k, word in enumerate(args):
+            taking = taking and not word.startswith("-")
+            if word == "--topics":
+                taking = True
+                if not args[k + 1 : k + 2] or args[k + 1].startswith("-"):
+                    raise click.UsageError("argument --topics: expected at least one topic", ctx)
+            else:
+                words += ["--topics", word] if taking else [word]
+        return super().parse_args(ctx, words)
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a number, got {text}") from None
-
-
-def main(args: list[str] | None = None) -> int:
-    """Play a bag; 0 at its end or when told to stop, 1 if its end is damaged, 2 for bad usage or a bad bag."""
-    argv = sys.argv if args is None else ["bag_player", *args]
-    arguments = _arguments(remove_ros_args(argv)[1:])
+@click.command(cls=_SeveralTopics, help=__doc__, context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option(
+    "--rate", type=_Number("a positive number", lambda v: v > 0), default=1.0, help="times the recorded speed"
+)
+@click.option("--loop", is_flag=True, help="start again at the end; stamps go backwards then")
+@click.option("--clock", is_flag=True, help="publish /clock, for nodes with use_sim_time")
+@click.option(
+    "--wait",
+    type=_Number("a number of seconds >= 0", lambda v: v >= 0),
+    default=1.0,
+    metavar="SECONDS",
+    help="how long to wait for a subscriber on every topic",
+)
+@click.option("--wait-for", default="", metavar="NODE", help="wait for this node's subscriptions instead")
+@click.option("--topics", multiple=True, metavar="TOPIC ...", help="play only these")
+@click.pass_obj
+def play(
+    argv: list[str],
+    bag: Path,
+    rate: float,
+    loop: bool,
+    clock: bool,
+    wait: float,
+    wait_for: str,
+    topics: tuple[str, ...],
+) -> int:
+    """Play a bag; the exit status. `argv` is the whole command line, for ROS."""
     status = 0
     try:
         with until_stopped():
             use_large_messages()
             rclpy.init(args=argv)
-            player = BagPlayer(arguments.bag, arguments.topics, arguments.clock)
-            player.wait_for_subscribers(arguments.wait, arguments.wait_for)
+            player = BagPlayer(bag, topics, clock)
+            player.wait_for_subscribers(wait, wait_for)
             loops, told = 0, float("-inf")
             while True:
-                count, loops = player.play(arguments.rate), loops + 1
+                count, loops = player.play(rate), loops + 1
                 if time.monotonic() - told >= REPORT_PERIOD:
                     told = time.monotonic()
                     again = f", {loops} times so far" if loops > 1 else ""
-                    player.get_logger().info(f"played {count} messages of {arguments.bag}{again}")
-                if not arguments.loop:
+                    player.get_logger().info(f"played {count} messages of {bag}{again}")
+                if not loop:
                     break
             player.finish(ACKNOWLEDGED_SECONDS)
     except BagError as error:
@@ -202,6 +223,16 @@ def main(args: list[str] | None = None) -> int:
     finally:
         shut_down()
     return status
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a bag; 0 at its end or when told to stop, 1 if its end is damaged, 2 for bad usage or a bad bag."""
+    argv = sys.argv if args is None else ["bag_player", *args]
+    try:
+        return play.main(remove_ros_args(argv)[1:], prog_name="bag_player", standalone_mode=False, obj=argv)
+    except click.UsageError as error:  # click would add two lines of usage
+        sys.stderr.write(f"bag_player: {error.format_message().rstrip('.')}; see bag_player --help\n")
+        return 2
 
 
 if __name__ == "__main__":

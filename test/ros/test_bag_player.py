@@ -28,9 +28,15 @@ def bag(tmp_path: Path, depth_frame) -> Path:
         (["CUT"], "truncated or damaged"),
         (["BAG", "--rate", "0"], "--rate: expected a positive number, got 0"),
         (["BAG", "--rate", "fast"], "--rate: expected a number, got fast"),
-        (["BAG", "--wait", "-1"], "--wait"),
+        (["BAG", "--rate", "nan"], "--rate: expected a positive number, got nan"),
+        (["BAG", "--wait", "-1"], "--wait: expected a number of seconds >= 0, got -1"),
+        (["BAG", "--topics", "--loop"], "--topics: expected at least one topic"),
+        (["BAG", "--topics"], "--topics: expected at least one topic"),
+        (["BAG", "--topics", "/rgb", "/more"], "/rgb, /more"),
+        (["BAG", "--topics", "/rgb", "--topics", "/more"], "/rgb, /more"),
+        (["BAG", "BAG"], "unexpected extra argument"),
         (["BAG", "--nonsense"], "--nonsense"),
-        ([], "bag"),
+        ([], "Missing argument 'BAG'"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(bag: Path, arguments: list[str], named: str, capsys) -> None:
@@ -39,13 +45,17 @@ def test_bad_input_is_one_line_and_status_2(bag: Path, arguments: list[str], nam
     cut, (whole,) = bag.parent / "cut.mcap", bag.glob("*.mcap")
     cut.write_bytes(whole.read_bytes()[:100])
     words = [{"BAG": str(bag), "EMPTY": str(empty), "CUT": str(cut)}.get(word, word) for word in arguments]
-    try:
-        status = main(words)
-    except SystemExit as end:  # argparse
-        status = end.code
-    assert status == 2
+    assert main(words) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("bag_player: ") and named in line
+
+
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_help_names_every_option(word: str, capsys) -> None:
+    assert main([word]) == 0
+    told = capsys.readouterr().out
+    names = ("BAG", "--rate", "--loop", "--clock", "--wait SECONDS", "--wait-for NODE", "--topics TOPIC ...")
+    assert all(name in told for name in names)
 
 
 def test_a_loop_publishes_what_was_recorded_again_and_again_with_the_clock(ros, bag: Path, depth_frame) -> None:
