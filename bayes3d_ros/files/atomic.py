@@ -9,31 +9,32 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def write_whole(
-    path: Path, write: Callable[[BinaryIO], Any], *, mode: int | None = None, replace: bool = True
-) -> None:
+def write_whole(path: Path, write: Callable[[BinaryIO], Any], *, mode: int | None = None, replace: bool = True) -> None:
     """Let `write` fill a temporary file, give it the name `path`, and return when both are on the disk.
 
-    The temporary file is `.NAME-*.tmp` in the same folder. It is deleted where `write` fails; it stays only where the
-    process is killed (`remove_leftovers`). `mode` is that of the file; by default what the umask leaves. Raises OSError;
-    where the file is there and not to be replaced, also one of another process from a moment ago, FileExistsError.
+    The temporary file is `.NAME-*.tmp` in the same folder. It goes away if `write` fails, and stays only if the process
+    is killed (`remove_leftovers`). `mode` is that of the file; by default what the umask leaves. Raises OSError; unless
+    `replace`, FileExistsError where `path` exists, also if another process has just written it.
     """
     temporary = path.with_name(f".{path.name}-{secrets.token_hex(8)}.tmp")
-    handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else mode)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         with os.fdopen(handle, "w+b") as file:
-            if mode is not None:
-                os.fchmod(handle, mode)
             write(file)
             file.flush()
+            if mode is not None:
+                os.fchmod(handle, mode)
             os.fsync(handle)
         if replace:
             os.replace(temporary, path)
         else:
             _move_to_new(temporary, path)
+        _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -42,9 +43,9 @@ def write_json(path: Path, content: Any) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete the temporary files of writers that were killed, in a folder that nobody else writes to. Raises OSError."""
-    for leftover in folder.glob(".*.tmp"):
+def remove_leftovers(folder: Path, names: str) -> None:
+    """Delete what killed writers of files with such names (a glob pattern) left behind. Raises OSError."""
+    for leftover in folder.glob(f".{names}-*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
