@@ -42,7 +42,7 @@ from jaxtyping import Array, Float, Int
 
 NO_RETURN, IN_WORKSPACE, BEYOND = 0, 1, 2  # kinds of pixels
 FAR_AWAY = 1e6  # stands for an infinite squared distance
-_SCALE = 1e4
+_PRODUCT_SCALE = 1e4  # metres: keeps products of likelihoods, per metre, in the range of float32
 LATERAL = 0.02
 
 
@@ -210,14 +210,14 @@ def _sum_log(
     """Sum of log(p outlier + (1 - p) inlier) over the first `count` pixels, through the logs of products of so many of
     them. Scaled, so that products stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre (four) or ..
     1e15 (two)."""
-    outlier, inlier = _SCALE * outlier, _SCALE * inlier
+    outlier, inlier = _PRODUCT_SCALE * outlier, _PRODUCT_SCALE * inlier
     p = p[None, :, None]
 
     def product_of(k: Int[Array, ""], total: Float[Array, "S P T"]) -> Float[Array, "S P T"]:
         product: Array | float = 1.0
         for m in range(at_once):
             product *= p * outlier[at_once * k + m] + (1 - p) * inlier[:, None, at_once * k + m]
-        return total + (jnp.log(product) - at_once * jnp.log(_SCALE))
+        return total + (jnp.log(product) - at_once * jnp.log(_PRODUCT_SCALE))
 
     start = jnp.zeros((inlier.shape[0], p.shape[1], outlier.shape[1]))
     return jax.lax.fori_loop(0, count // at_once, product_of, start)

@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.objects.library_arrays import EMPTY, INFLATION, OFFSET_RANGE, LibraryArrays
 
-NEAR = 0.05  # metres: nothing is met before
-_FIRST_STEPS = 4  # of all rays alike
+NEAREST_HIT = 0.05  # metres: nothing is met before
+_STEPS_OF_ALL_RAYS = 4  # of all rays alike
 # Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
 _STAGES = ((2, 4), (8, 8), (16, 96))
-MOST_STEPS = _FIRST_STEPS + sum(steps for _, steps in _STAGES)
+MOST_STEPS = _STEPS_OF_ALL_RAYS + sum(steps for _, steps in _STAGES)
 NUDGE = 2e-3  # voxels, past a cube's face
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
@@ -42,7 +42,7 @@ def march(
     type_index: Int[Array, "..."],
     T_camera_object: Float[Array, "... 4 4"],
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
-    near: float = NEAR,
+    near: float = NEAREST_HIT,
 ) -> Float[Array, "..."]:
     """Depth z in metres along rays (x, y, 1) of an object each, NO_SURFACE where it is not met.
 
@@ -58,7 +58,7 @@ def march(
         rays,
         near,
     )
-    t = jax.lax.fori_loop(0, _FIRST_STEPS, lambda _, t: advance(_look_up(library.words), walk, t, near), t)
+    t = jax.lax.fori_loop(0, _STEPS_OF_ALL_RAYS, lambda _, t: advance(_look_up(library.words), walk, t, near), t)
     t = _finish(library.words, walk, t.ravel(), near).reshape(t.shape)
     return depth_met(t)
 

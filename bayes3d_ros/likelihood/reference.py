@@ -10,7 +10,7 @@ from bayes3d_ros.objects.library_arrays import INFLATION
 from bayes3d_ros.objects.model import ObjectModel
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
-_AT_A_TIME = 256  # rays, which bounds memory
+_RAYS_AT_A_TIME = 256  # rays, which bounds memory
 
 
 def render(
@@ -47,8 +47,8 @@ def _pairs(
     tree = None if close else cKDTree(from_eye / distance[:, None])
     chord = 2 * np.sin(0.5 * np.arcsin(_CORNER / max(distance.min(), 2 * _CORNER)))
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    for first in range(0, len(unit), _AT_A_TIME):
-        some = unit[first : first + _AT_A_TIME]
+    for first in range(0, len(unit), _RAYS_AT_A_TIME):
+        some = unit[first : first + _RAYS_AT_A_TIME]
         found = [np.arange(len(from_eye))] * len(some) if tree is None else tree.query_ball_point(some, chord)
         yield first + np.repeat(np.arange(len(some)), [len(f) for f in found]), np.concatenate(found).astype(int)
 

@@ -14,7 +14,7 @@ _TARGET = "bayes3d_cell_scores"  # to XLA
 _ORIENTATIONS_AT_ONCE = 8  # their points stay in the first-level cache, and are a multiple of a vector
 _NEAREST_M, _FARTHEST_M = 0.02, 1e6  # metres
 
-f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/loops.py`
+f32, i32, u64 = np.float32, np.int32, np.uint64  # unsigned places: see `likelihood/cpu/buffers.py`
 
 
 def cell_scores(

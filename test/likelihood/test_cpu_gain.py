@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.likelihood.cpu import loops
+from bayes3d_ros.likelihood.cpu import packing, windows
 from bayes3d_ros.likelihood.cpu.gain import compiled_depth, compiled_gain
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
@@ -94,10 +94,10 @@ def test_what_is_nowhere_is_not_rendered(wrong, hypotheses, image, arrays):
 
 def test_exponentials_and_logarithms():
     x = np.float32(-np.geomspace(1e-7, 86, 4000))
-    got = np.array([loops._exp(v) for v in x])
+    got = np.array([windows.exp(v) for v in x])
     np.testing.assert_allclose(got, np.exp(x.astype(float)), rtol=1e-5)
     x = np.float32(np.geomspace(1e-30, 1e30, 4001))
-    np.testing.assert_allclose([loops._log(v) for v in x], np.log(x.astype(float)), rtol=1e-6, atol=3e-7)
+    np.testing.assert_allclose([windows.log(v) for v in x], np.log(x.astype(float)), rtol=1e-6, atol=3e-7)
 
 
 @pytest.mark.parametrize("permutes", [True, False])
@@ -105,12 +105,12 @@ def test_exponentials_and_logarithms():
 def test_packing(permutes, kind, monkeypatch):
     """Members of every set of eight come first, in order, with the machine's own instruction and without."""
     if not permutes:
-        monkeypatch.setattr(loops, "_permutes", lambda context: False)
-    pack = numba.njit(lambda array, bits, orders, to: loops._pack(array, np.uint64(8), orders, bits, to, np.uint64(3)))
+        monkeypatch.setattr(packing, "_permutes", lambda context: False)
+    pack = numba.njit(lambda array, bits, orders, to: packing.pack(array, np.uint64(8), orders, bits, to, np.uint64(3)))
     array, to = np.arange(100, 116).astype(kind), np.zeros(12, kind)
     for bits in range(256):
-        pack(array, np.uint64(bits), loops._ORDERS, to)
+        pack(array, np.uint64(bits), packing.ORDERS, to)
         members = [k for k in range(8) if bits >> k & 1]
-        assert loops._MEMBERS[bits] == len(members)
+        assert packing.MEMBERS[bits] == len(members)
         np.testing.assert_array_equal(to[3 : 3 + len(members)], array[8:][members])
         assert sorted(to[3:11]) == sorted(array[8:]) and not to[:3].any() and not to[11:].any()

@@ -72,7 +72,7 @@ def test_a_constant_of_another_file_and_a_class_that_is_gone(copy):
 
 
 def test_a_folder_that_cannot_be_written_does_no_harm(copy, monkeypatch):
-    old = copy / "likelihood/cpu/__pycache__/loops._exp_0123-1.py312.nbi"
+    old = copy / "likelihood/cpu/__pycache__/rays._walk_0123-1.py312.nbi"
     old.parent.mkdir()
     old.touch()
 
@@ -81,9 +81,9 @@ def test_a_folder_that_cannot_be_written_does_no_harm(copy, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", refuse)
-        compiling._remove_others([copy / "likelihood/cpu/loops.py"], "4567")
+        compiling._remove_others([copy / "likelihood/cpu/rays.py"], "4567")
     assert old.exists()
-    compiling._remove_others([copy / "likelihood/cpu/loops.py"], "4567")
+    compiling._remove_others([copy / "likelihood/cpu/rays.py"], "4567")
     assert not old.exists()
 
 

@@ -1,4 +1,4 @@
-"""The loops of `loops.py` as functions of JAX, for CPUs."""
+"""The loops of `handlers.py` as functions of JAX, for CPUs."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.cpu import loops
+from bayes3d_ros.likelihood.cpu.handlers import DEPTH_TARGET, GAIN_TARGET
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
-_NEGLIGIBLE = 14.0  # nats below the outliers' density: one in a million
+_NEGLIGIBLE_NATS = 14.0  # nats below the outliers' density: one in a million
 
 
 @partial(jax.jit, static_argnames="window")
@@ -43,7 +43,7 @@ def compiled_gain(
         _real(noise.p_outlier),
         _whole([window, hypotheses.everywhere, *scene_shape, image.own_rows]),
     )
-    return _call(loops.GAIN, shape, inputs)
+    return _call(GAIN_TARGET, shape, inputs)
 
 
 @partial(jax.jit, static_argnames="border")
@@ -65,7 +65,7 @@ def compiled_depth(
         jnp.zeros(0) if start is None else _real(start),
         _whole([*shape[1:], border, hypotheses.everywhere, image.own_rows]),
     )
-    return _call(loops.DEPTH, shape, inputs)
+    return _call(DEPTH_TARGET, shape, inputs)
 
 
 def _things(hypotheses: RenderedHypotheses, library: LibraryArrays) -> tuple[Array, ...]:
@@ -102,7 +102,7 @@ def _reach(image: ScoredImage, noise: Noise, window: int) -> tuple[Float[Array, 
     least = jnp.where(image.pixel_class == IN_WORKSPACE, image.depth, jnp.inf).min()
     peak = 1 / (jnp.sqrt(2 * jnp.pi) * noise.sigma.min() * image.outlier_scale * least**2)
     odds = (1 - noise.p_outlier.min()) / jnp.maximum(noise.p_outlier.min(), 1e-12)
-    nats = _NEGLIGIBLE + jnp.log1p(odds * peak)
+    nats = _NEGLIGIBLE_NATS + jnp.log1p(odds * peak)
     own = jnp.where(jnp.arange(len(image.ray_y)) < image.own_rows, image.ray_y, 0.0)
     sides = jnp.abs(image.ray_x).max() / image.focal[0] + jnp.abs(own).max() / image.focal[1]
     return noise.sigma.max() * jnp.sqrt(2 * nats), window // 2 * sides

@@ -19,7 +19,7 @@ from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_pixel_cl
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import (
     MOST_STEPS,
-    NEAR,
+    NEAREST_HIT,
     NO_SURFACE,
     advance,
     depth_met,
@@ -32,7 +32,7 @@ from bayes3d_ros.likelihood.tiles import LARGE, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 _PROGRAMS = 1024  # at a time, at most
-_BLOCK = 128  # rays, or pixels, that a program's threads look at together
+_BLOCK_PIXELS = 128  # rays, or pixels, that a program's threads look at together
 _WARPS = 4
 
 
@@ -188,11 +188,11 @@ def _blocks(area: Array, across: Array) -> tuple[Array, Any]:
     """How many blocks there are in so many pixels; block(k): their number, row and column, and whether they are any."""
 
     def block(k: Array) -> tuple[Array, Array, Array, Array]:
-        index = k * _BLOCK + jax.lax.iota(jnp.int32, _BLOCK)
+        index = k * _BLOCK_PIXELS + jax.lax.iota(jnp.int32, _BLOCK_PIXELS)
         row = index // jnp.maximum(across, 1)
         return index, row, index - row * across, index < area
 
-    return (area + _BLOCK - 1) // _BLOCK, block
+    return (area + _BLOCK_PIXELS - 1) // _BLOCK_PIXELS, block
 
 
 def _render(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
@@ -226,7 +226,7 @@ def _render(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: 
                 given.size[type_id],
                 [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
                 (x, y),
-                NEAR,
+                NEAREST_HIT,
             )
             walk = walk._replace(leave=jnp.where(inside, walk.leave, -NO_SURFACE))
 
@@ -236,7 +236,7 @@ def _render(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: 
 
             def go(state: tuple[Array, Array], walk=walk) -> tuple[Array, Array]:
                 step, t = state
-                return step + 1, advance(look_up, walk, t, NEAR)
+                return step + 1, advance(look_up, walk, t, NEAREST_HIT)
 
             t = jax.lax.while_loop(unfinished, go, (jnp.int32(0), t))[1]
             depth = jnp.minimum(depth, depth_met(t))
