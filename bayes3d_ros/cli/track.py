@@ -26,7 +26,7 @@ def track(
 ) -> None:
     """Follow the camera of BAG around what its first frame shows, or around a known world."""
     from bayes3d_ros.io.bags import read_frames
-    from bayes3d_ros.io.tracking_results import PICTURE, TrackWriter, plot_track
+    from bayes3d_ros.io.tracking_results import PICTURE_FILE, TrackWriter, plot_track
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.parsing.parser import SceneParser
@@ -68,5 +68,5 @@ def track(
     lost = sum(bool(estimate.lost) for estimate in done)
     summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
     summary += f", {failed} could not be" if failed else ""
-    plot_track(done, out / PICTURE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
+    plot_track(done, out / PICTURE_FILE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
     click.echo(f"{summary}; results in {out}")

@@ -20,7 +20,7 @@ COLOURS = (
     "#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442",
     "#332288", "#999933", "#882255", "#88CCEE", "#117733",
 )  # fmt: skip
-NO_RETURN, OTHER, INK = "#d8d8d8", "#555555", "#222222"
+NO_RETURN_COLOUR, OTHER_COLOUR, INK = "#d8d8d8", "#555555", "#222222"
 MOST_LISTED, MOST_POINTS = 12, 4000
 
 
@@ -88,7 +88,7 @@ def colour(label: int) -> str:
 
 
 def _depth_panel(axis: Axes, depth: Float[np.ndarray, "height width"], scale: Normalize, title: str) -> Any:
-    image = axis.imshow(depth, cmap=colormaps["cividis_r"].with_extremes(bad=NO_RETURN), norm=scale)
+    image = axis.imshow(depth, cmap=colormaps["cividis_r"].with_extremes(bad=NO_RETURN_COLOUR), norm=scale)
     _bare(axis, title)
     return image
 
@@ -122,7 +122,7 @@ def _number_objects(axis: Axes, posterior: ScenePosterior) -> None:
         if len(v):
             # The pixel of the mask nearest to its middle: on the object even where it is bent or cut in two.
             k = int(np.argmin(np.square(v - v.mean()) + np.square(u - u.mean())))
-            _number(axis, u[k], v[k], label)
+            _place_number(axis, u[k], v[k], label)
 
 
 def _samples_panel(
@@ -154,11 +154,11 @@ def _samples_panel(
         own = owner == k
         if own.any():
             alpha = np.clip(weight[own] / weight[own].max(), 0.08, 1.0) if k >= 0 else np.clip(weight[own], 0.08, 1.0)
-            tone, marker = (colour(k + 1), "o") if k >= 0 else (OTHER, "x")
+            tone, marker = (colour(k + 1), "o") if k >= 0 else (OTHER_COLOUR, "x")
             size = 9 if k >= 0 else 22
             axis.scatter(place[own, 0], place[own, 1], s=size, c=tone, marker=marker, alpha=alpha, linewidths=0.8)
     for k in range(len(posterior.objects)):
-        _number(axis, centres[k, 0], centres[k, 1], k + 1, offset=(13, 13))
+        _place_number(axis, centres[k, 0], centres[k, 1], k + 1, offset=(13, 13))
 
     # The listed objects fill the view: samples of the prior may lie anywhere on the table.
     around = centres if len(centres) else place
@@ -187,12 +187,12 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
         axis.text(x, y, text, fontsize=9, color="#666666", va="top")
     for k, found in enumerate(shown):
         y -= step
-        _number(axis, 0.02, y - 0.02, k + 1)
+        _place_number(axis, 0.02, y - 0.02, k + 1)
         words = (
             _shorten(found.type, 24),
             f"{found.type_probabilities[found.type]:.3f}",
             f"{found.probability:.3f}",
-            _spread(found),
+            _spread_words(found),
         )
         for (x, _), text in zip(columns, words, strict=True):
             axis.text(x + 0.055 if x == 0 else x, y, text, fontsize=9.5, color=INK, va="top")
@@ -212,7 +212,7 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
     axis.text(0.0, y - step - 0.02, "\n".join(lines), fontsize=9, color="#444444", va="top", linespacing=1.6)
 
 
-def _spread(found: ObjectEstimate) -> str:
+def _spread_words(found: ObjectEstimate) -> str:
     place = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
     turn = np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:])))
     return f"{_short(place)} mm  {_short(turn)}°"
@@ -227,7 +227,7 @@ def _shorten(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-def _number(axis: Axes, x: float, y: float, label: int, offset: tuple[float, float] = (0.0, 0.0)) -> None:
+def _place_number(axis: Axes, x: float, y: float, label: int, offset: tuple[float, float] = (0.0, 0.0)) -> None:
     axis.annotate(
         str(label), (x, y), offset, textcoords="offset points", ha="center", va="center", fontsize=8.5,
         fontweight="bold", color=INK, annotation_clip=False,

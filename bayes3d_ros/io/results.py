@@ -16,7 +16,7 @@ from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
 
-SCENES, SAMPLES, FRAMES = "scenes.jsonl", "samples.npz", "frames"
+SCENES_FILE, SAMPLES_FILE, FRAMES_FOLDER = "scenes.jsonl", "samples.npz", "frames"
 
 
 class ResultsError(Exception):
@@ -81,14 +81,14 @@ class ResultsWriter:
 
     def __enter__(self) -> "ResultsWriter":
         try:
-            (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
-            if (self.folder / SCENES).exists():  # an earlier run's frames would look like this one's
-                for path in (self.folder / FRAMES).iterdir():
+            (self.folder / FRAMES_FOLDER).mkdir(parents=True, exist_ok=True)
+            if (self.folder / SCENES_FILE).exists():  # an earlier run's frames would look like this one's
+                for path in (self.folder / FRAMES_FOLDER).iterdir():
                     if re.fullmatch(r"-?\d+(_\d+)?\.(npz|png)", path.name):
                         path.unlink()
-                (self.folder / SAMPLES).unlink(missing_ok=True)
-            self._scenes = (self.folder / SCENES).open("w")
-            self._rows = (self.folder / f".{SAMPLES}.rows").open("w+b")
+                (self.folder / SAMPLES_FILE).unlink(missing_ok=True)
+            self._scenes = (self.folder / SCENES_FILE).open("w")
+            self._rows = (self.folder / f".{SAMPLES_FILE}.rows").open("w+b")
         except OSError as error:
             raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
         return self
@@ -96,7 +96,7 @@ class ResultsWriter:
     def write(self, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Path:
         """Append a frame; depth is what was parsed, in metres. Returns where its PNG belongs. Raises OSError."""
         try:
-            path = self.folder / FRAMES / f"{self._frame_name(posterior.stamp_ns)}.npz"
+            path = self.folder / FRAMES_FOLDER / f"{self._frame_name(posterior.stamp_ns)}.npz"
             images: dict[str, Any] = {
                 "depth": np.asarray(depth, np.float32),
                 "reconstruction": np.asarray(posterior.reconstruction, np.float32),
@@ -126,7 +126,7 @@ class ResultsWriter:
         self._scenes.close()
         self._rows.flush()
         rows = np.memmap(self._rows, _ROW, "r") if self._rows.tell() else np.zeros(0, _ROW)
-        write_whole(self.folder / SAMPLES, lambda file: self._write_samples(file, rows))
+        write_whole(self.folder / SAMPLES_FILE, lambda file: self._write_samples(file, rows))
         self._rows.close()
         Path(self._rows.name).unlink()
 

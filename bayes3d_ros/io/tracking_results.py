@@ -16,7 +16,7 @@ from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.io.results import ResultsError, json_number, json_numbers
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate
 
-CAMERAS, PICTURE = "cameras.jsonl", "track.png"
+CAMERAS_FILE, PICTURE_FILE = "cameras.jsonl", "track.png"
 
 
 def camera_record(estimate: CameraEstimate) -> dict[str, Any]:
@@ -48,8 +48,8 @@ class TrackWriter:
     def __enter__(self) -> "TrackWriter":
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / PICTURE).unlink(missing_ok=True)  # an earlier run's
-            self._file = (self.folder / CAMERAS).open("w")
+            (self.folder / PICTURE_FILE).unlink(missing_ok=True)  # an earlier run's
+            self._file = (self.folder / CAMERAS_FILE).open("w")
         except OSError as error:
             raise ResultsError(f"{self.folder}: cannot write results here ({error.strerror})") from error
         return self

@@ -16,9 +16,9 @@ from bayes3d_ros.objects.store import load_model, save_model
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import LearnerSettings
 from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors
-from bayes3d_ros.validation.simulate.random_scenes import CAMERA, resting_object
+from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, resting_object
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster
-from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
 
 pytest.importorskip("mujoco")
 SETTINGS = LearnerSettings(voxel_size=0.005)
@@ -171,10 +171,10 @@ def empty_table(seed, noise):
     """A bare table from above, with a camera's noise; its size is the image's."""
     table, T_table_camera = np.eye(4), look_at(np.array([0.16, -0.2, 0.7]), np.zeros(3))
     table[2, 3] = -0.015
-    clean = RayCaster([(Box((2.4, 1.8, 0.03)), table)]).render(T_table_camera, CAMERA)
+    clean = RayCaster([(Box((2.4, 1.8, 0.03)), table)]).render(T_table_camera, REALSENSE)
     rng = np.random.default_rng(seed)
-    depth = add_sensor_noise(clean.depth, clean.cosine, CAMERA, noise, draw_bias_field(noise, rng), rng)
-    return DepthFrame(depth.astype(np.float32), CAMERA, 1, "camera", T_table_camera)
+    depth = add_sensor_noise(clean.depth, clean.cosine, REALSENSE, noise, sample_bias_field(noise, rng), rng)
+    return DepthFrame(depth.astype(np.float32), REALSENSE, 1, "camera", T_table_camera)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from bayes3d_ros.validation.experiments.exactness import binned, problem_summary
 from bayes3d_ros.validation.reference import exact_reference
 from bayes3d_ros.validation.reference.exact_pairs import close_to, true_places
 from bayes3d_ros.validation.reference.exact_reference import enumerate_object, marginals, yaw_cells
-from bayes3d_ros.validation.reference.small_problems import PROBLEMS, SIGMA_MAX, WINDOW
+from bayes3d_ros.validation.reference.small_problems import PROBLEMS, SIGMA_MAX, SMALL_WINDOW
 from bayes3d_ros.validation.statistics.agreement import (
     evidence_weights,
     number_of_objects,
@@ -139,7 +139,7 @@ def test_a_handle_in_sight(seen, seen_exact, seen_sampled, step):
 def test_pixels_that_count_in_part(seen, step):
     """The posterior of a weighted likelihood is enumerated like any other; it is wider."""
     context = seen.context._replace(image=seen.context.image._replace(weight=np.float32(0.4)))
-    grid = for_image(noise_grid(SIGMA_MAX), context.image, WINDOW)
+    grid = for_image(noise_grid(SIGMA_MAX), context.image, SMALL_WINDOW)
     part = seen._replace(context=context, grid=grid)
     log_z, mixed = sampled(part, step())
     log_truth, truth = enumerated(part)
@@ -177,7 +177,7 @@ def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
             "marginals": seen_exact[1]._asdict(),
         }
         row = exact | {"marginals": said._asdict(), "error": 0.0, "ess": 4000.0}
-        row |= {f"{what}_{name}": 0.0 for what in ("tv", "limit") for name in exactness.QUANTITIES}
+        row |= {f"{what}_{name}": 0.0 for what in ("tv", "limit") for name in exactness.COMPARED_QUANTITIES}
         told.append(problem_summary(exact | {"halving_moves": [0, 0.01], "neglected": 0}, [row, row]))
     right, prior = told
     assert right["not_met"] == [] and set(right["width"].values()) == {1.0}

@@ -12,7 +12,7 @@ from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
-from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth
+from bayes3d_ros.validation.reference.prior_predictive import DepthRange, sample_depth
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006
 
@@ -180,7 +180,7 @@ def test_the_noise_of_an_image_is_covered(scene, grid, sigma, p_outlier):
         DepthRange(0.1, 5.0),
     )
     rng = np.random.default_rng(7)
-    depth = draw_depth(rng, clean, rays[0, :, 0], rays[:, 0, 1], (sigma, p_outlier), limits, WINDOW)
+    depth = sample_depth(rng, clean, rays[0, :, 0], rays[:, 0, 1], (sigma, p_outlier), limits, WINDOW)
     context = Context(scene.image(depth), scene.arrays, scene.table)
     state, _ = step(jax.random.key(0), start(context, grid, scene), 0, context, grid, scene)
     found = jax.jit(sample)(jax.random.key(1), state.loglik_grid, grid)

@@ -24,7 +24,7 @@ from bayes3d_ros.validation.reference.calibration_problem import (
     render,
     small_problem,
 )
-from bayes3d_ros.validation.reference.prior_predictive import draw_noise, draw_scene
+from bayes3d_ros.validation.reference.prior_predictive import sample_noise, sample_scene
 
 FEW = 6
 
@@ -41,8 +41,8 @@ def rows(problem):
 
 def from_prior(problem, rng, image, count=24):
     """The prior in place of the posterior."""
-    drawn = [draw_scene(jax.random.key(int(rng.integers(2**31))), *_prior(problem)) for _ in range(count)]
-    noise = np.array([draw_noise(rng, problem.grid) for _ in drawn])
+    drawn = [sample_scene(jax.random.key(int(rng.integers(2**31))), *_prior(problem)) for _ in range(count)]
+    noise = np.array([sample_noise(rng, problem.grid) for _ in drawn])
     fits = [log_likelihood(render(objects, number, problem), image, problem) for objects, number in drawn]
     objects = jax.tree.map(lambda *a: np.stack(a), *(objects for objects, _ in drawn))
     numbers = np.array([number for _, number in drawn])
@@ -71,7 +71,7 @@ def test_the_truth_is_scored_as_the_sampler_scores_it(problem, likelihood):
     """The likelihood of a scene drawn whole is that which the sampler sums object by object."""
     if likelihood == "points":
         problem = small_problem(calibration_points.POINTS)
-    objects, _ = draw_scene(jax.random.key(0), np.array([-np.inf, 0.0]), problem.library, problem.table)
+    objects, _ = sample_scene(jax.random.key(0), np.array([-np.inf, 0.0]), problem.library, problem.table)
     surface = render(objects, 1, problem)
     image = observe(np.random.default_rng(0), surface, (0.002, 0.1), problem)
     assert (image.points is not None) == (likelihood == "points")
@@ -93,7 +93,7 @@ def test_splines_in_sigma_are_as_good_as_many_sigmas(problem):
     scenes = pad_scene(jnp.asarray(bare)[None], window)
     for k in range(12):
         rng = np.random.default_rng((100, k))
-        sigma, p_outlier = draw_noise(rng, problem.grid)
+        sigma, p_outlier = sample_noise(rng, problem.grid)
         image = observe(rng, bare, (sigma, p_outlier), problem)
         u = np.linspace(*np.log([0.8 * sigma, min(1.25 * sigma, problem.settings.sigma_max)]), 200)
         values = Noise(jnp.float32(np.exp(u)), jnp.float32([p_outlier]))

@@ -12,7 +12,13 @@ from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.validation.experiments import camera_tracking
-from bayes3d_ros.validation.simulate.panning_camera import RATE, WALL, independent_frames, own_frames, panning_cameras
+from bayes3d_ros.validation.simulate.panning_camera import (
+    FRAME_RATE,
+    WALL,
+    independent_frames,
+    own_frames,
+    panning_cameras,
+)
 from bayes3d_ros.validation.simulate.sensor_noise import NO_NOISE
 
 EXTENTS = (0.06, 0.10, 0.16)
@@ -77,7 +83,7 @@ class OffByAMillimetre:
 
     def step(self, known, frame):
         assert frame.intrinsics.width == self.settings.score_width == 25
-        k = round((frame.stamp_ns - 1_700_000_000 * 10**9) * RATE * 1e-9)
+        k = round((frame.stamp_ns - 1_700_000_000 * 10**9) * FRAME_RATE * 1e-9)
         off = pose_matrix([0.0, 0.001, 0.0], Rotation.from_rotvec([0, 0, np.radians(0.2)]).as_quat())
         estimate = SimpleNamespace(T_world_camera=self.poses[k] @ off, seconds=0.05, lost="dark" if k == 2 else "")
         return known + 1, estimate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.validation.simulate.correlated_errors import draw_correlated_errors
+from bayes3d_ros.validation.simulate.correlated_errors import sample_correlated_errors
 from bayes3d_ros.validation.simulate.ray_casting import Rendering
 from bayes3d_ros.validation.simulate.sensor_noise import NO_NOISE, SensorNoise
 
@@ -16,7 +16,7 @@ STILL = np.eye(4)
 
 
 def errors_of(noise, seed, solid=0, depth=FLAT, objects=1, T=STILL):
-    drawn = draw_correlated_errors(noise, objects, np.random.default_rng(seed))
+    drawn = sample_correlated_errors(noise, objects, np.random.default_rng(seed))
     return drawn.at(Rendering(depth, np.full(FLAT.shape, solid) if np.isscalar(solid) else solid, FLAT), T, CAMERA)
 
 

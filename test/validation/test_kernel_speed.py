@@ -26,14 +26,15 @@ def test_objects_stand_upright_around_a_place_before_the_camera(work):
     assert np.allclose(T[:, :3, 2], [0, -1, 0])  # up is against the image's rows
     assert np.allclose(np.linalg.det(T[:, :3, :3]), 1, atol=1e-5)
     assert (
-        np.abs(T[:, :3, 3] - [0, 0, kernel_speed.DISTANCE]) <= [kernel_speed.PLACES, 1e-6, kernel_speed.PLACES]
+        np.abs(T[:, :3, 3] - [0, 0, kernel_speed.OBJECT_DISTANCE])
+        <= [kernel_speed.OBJECT_SHIFT, 1e-6, kernel_speed.OBJECT_SHIFT]
     ).all()
 
 
 def test_plain_jax_computes_our_likelihood(work):
     T = jnp.asarray(work.T_camera_object)
     ours = kernel_speed.OURS["render+score"](T, work.image, work.library)
-    plain = peers.plain_log_likelihood(T, work.image, work.library, kernel_speed.noise(), kernel_speed.WINDOW)
+    plain = peers.plain_log_likelihood(T, work.image, work.library, kernel_speed.noise(), kernel_speed.TIMED_WINDOW)
     nothing = jnp.log(work.image.outlier_scale * work.image.depth**2).sum()
     assert np.ptp(ours) > 10
     assert np.allclose(ours, plain - nothing, atol=2e-2)
@@ -45,7 +46,7 @@ def test_ray_casters_meet_what_stands_there(work, name):
     scene = peers.RAY_CASTERS[name](trimesh.creation.box(BOX))
     rays = kernel_speed._in_object(work.T_camera_object[:1], np.array([[0.0, 0.0, 1.0], [0.9, 0.0, 1.0]]))
     hit, missed = np.asarray(scene.cast(scene.prepare(*rays)))
-    assert kernel_speed.DISTANCE - 0.25 < hit < kernel_speed.DISTANCE + 0.15 and missed > 1e3
+    assert kernel_speed.OBJECT_DISTANCE - 0.25 < hit < kernel_speed.OBJECT_DISTANCE + 0.15 and missed > 1e3
 
 
 def test_where_nothing_was_observed_nothing_is_scored(work):
@@ -95,7 +96,8 @@ def test_rows_come_in_the_order_of_the_cases(work, tmp_path, monkeypatch):
     trimesh.creation.box(BOX).export(mesh_file)
     monkeypatch.setattr(kernel_speed, "ycb_mesh", lambda name: mesh_file)
     monkeypatch.setattr(kernel_speed, "ycb_library", lambda names, folder, voxel: save_model(model, folder))
-    for name, value in {"SIZES": (10,), "COUNTS": (1, 4), "PEER_COUNT": 4, "_ROUNDS": 2, "_AT_LEAST": 0.0}.items():
+    small = {"TIMED_SIZES": (10,), "TIMED_COUNTS": (1, 4), "PEER_COUNT": 4, "_ROUNDS": 2, "_AT_LEAST": 0.0}
+    for name, value in small.items():
         monkeypatch.setattr(kernel_speed, name, value)
     monkeypatch.setattr(peers, "installed", list)
     rows = [(r["what"], r["backend"], r["size"], r["hypotheses"]) for r in kernel_speed.rows()]

@@ -18,10 +18,10 @@ from bayes3d_ros.validation.reference.calibration_problem import small_problem
 from bayes3d_ros.validation.reference.prior_predictive import (
     DepthRange,
     _proposals,
-    draw_depth,
-    draw_noise,
-    draw_points,
-    draw_scene,
+    sample_depth,
+    sample_noise,
+    sample_points,
+    sample_scene,
 )
 from bayes3d_ros.validation.statistics.ranks import rank
 
@@ -76,7 +76,7 @@ def test_images_are_of_the_likelihood_s_density(sigma, p_outlier):
     def p_values(error):
         draws = np.stack(
             [
-                draw_depth(rng, surface(), RAY_X, RAY_Y, (error * sigma, p_outlier), LIMITS, WINDOW).ravel()
+                sample_depth(rng, surface(), RAY_X, RAY_Y, (error * sigma, p_outlier), LIMITS, WINDOW).ravel()
                 for _ in range(2000)
             ]
         )
@@ -94,7 +94,7 @@ def problem():
 
 def test_one_object_is_of_its_prior(problem):
     log_count = np.array([-np.inf, 0.0])
-    drawn = [draw_scene(jax.random.key(k), log_count, problem.library, problem.table) for k in range(300)]
+    drawn = [sample_scene(jax.random.key(k), log_count, problem.library, problem.table) for k in range(300)]
     assert all(number == 1 for _, number in drawn)
     objects = jax.tree.map(lambda *a: np.stack(a)[:, 0], *(objects for objects, _ in drawn))
     log_p = np.asarray(log_prior(objects, problem.library, problem.table))
@@ -109,7 +109,7 @@ def test_one_object_is_of_its_prior(problem):
 def test_number_and_objects_are_rejected_together(problem):
     """n is likelier the more of its scenes are free of conflicts: P(n) Z_n, and what is drawn is free of them."""
     log_count = np.log([0.2, 0.3, 0.5])
-    drawn = [draw_scene(jax.random.key(k), log_count, problem.library, problem.table) for k in range(500)]
+    drawn = [sample_scene(jax.random.key(k), log_count, problem.library, problem.table) for k in range(500)]
     numbers = np.array([number for _, number in drawn])
     pairs = jax.tree.map(lambda *a: np.stack(a), *(objects for objects, number in drawn if number == 2))
     first, second = (jax.tree.map(lambda a, k=k: a[:, k], pairs) for k in (0, 1))
@@ -126,12 +126,12 @@ def test_number_and_objects_are_rejected_together(problem):
 def test_a_table_too_small_for_its_objects_is_told(problem):
     table = problem.table._replace(size=jnp.full(2, 0.01))
     with pytest.raises(ValueError, match="too small"):
-        draw_scene(jax.random.key(0), np.array([-np.inf, -np.inf, 0.0]), problem.library, table)
+        sample_scene(jax.random.key(0), np.array([-np.inf, -np.inf, 0.0]), problem.library, table)
 
 
 def test_noise_is_of_the_prior_that_is_integrated(problem):
     rng = np.random.default_rng(0)
-    sigma, p_outlier = np.array([draw_noise(rng, problem.grid) for _ in range(1500)]).T
+    sigma, p_outlier = np.array([sample_noise(rng, problem.grid) for _ in range(1500)]).T
     for drawn, grid in ((sigma, problem.grid.fine.sigma), (p_outlier, problem.grid.fine.p_outlier)):
         low, high = float(grid[0]), float(grid[-1])
         assert low <= drawn.min() and drawn.max() <= high
@@ -178,9 +178,9 @@ def noise_ranks(cloud, scenes, error=1.0, scored=None):
     table_of = jax.jit(log_likelihood_scene, static_argnames="window")
     draw = jax.jit(lambda key, table: sample(key, jnp.repeat(table, samples, 0), cloud.grid))
     for k in range(scenes):
-        sigma, p_outlier = draw_noise(rng, cloud.grid)
+        sigma, p_outlier = sample_noise(rng, cloud.grid)
         rays = np.asarray(cloud.image.ray_x), np.asarray(cloud.image.ray_y)
-        points = draw_points(rng, cloud.surface, *rays, (error * sigma, p_outlier), LIMITS)
+        points = sample_points(rng, cloud.surface, *rays, (error * sigma, p_outlier), LIMITS)
         assert int((points.pixel_class != NO_RETURN).sum()) == cloud.surface.size
         drawn = draw(jax.random.key(k), table_of(scene, cloud.image._replace(points=points), cloud.grid.coarse, WINDOW))
         equal = np.full(samples, 1 / samples)

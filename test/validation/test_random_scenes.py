@@ -11,7 +11,7 @@ pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
 from bayes3d_ros.geometry.camera import project, unproject
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.simulate import random_scenes
-from bayes3d_ros.validation.simulate.random_scenes import CAMERA, perfect_depth, random_scene, resting_object
+from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, perfect_depth, random_scene, resting_object
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster, SimulationError
 from bayes3d_ros.validation.simulate.sensor_noise import NO_NOISE
 
@@ -55,8 +55,8 @@ def test_the_camera_looks_down_from_where_it_should_and_sees_the_whole_object(br
         pitch = np.degrees(np.arcsin(-pose[2, 2]))
         assert 30 <= pitch <= 60
         assert 0.2 < pose[2, 3] < 0.9 + SIZE.max()
-        pixels, z = project((on_table(brick, scene) - pose[:3, 3]) @ pose[:3, :3], CAMERA)
-        assert (z > 0.2).all() and (pixels > 0).all() and (pixels < [CAMERA.width - 1, CAMERA.height - 1]).all()
+        pixels, z = project((on_table(brick, scene) - pose[:3, 3]) @ pose[:3, :3], REALSENSE)
+        assert (z > 0.2).all() and (pixels > 0).all() and (pixels < [REALSENSE.width - 1, REALSENSE.height - 1]).all()
 
 
 def test_depth_is_that_of_ray_casting_the_whole_scene(brick):
@@ -65,9 +65,9 @@ def test_depth_is_that_of_ray_casting_the_whole_scene(brick):
     ours = perfect_depth(brick, scene.T_table_object, pose)
     table, floor = np.eye(4), np.eye(4)
     table[2, 3], floor[2, 3] = -0.0005, -random_scenes.TABLE_HEIGHT - 0.5
-    size = random_scenes.TABLE_SIZE
+    size = random_scenes.TABLE_SIDE
     solids = [(brick.mesh, scene.T_table_object), (Box((size, size, 0.001)), table), (Box((99, 99, 1)), floor)]
-    reference = RayCaster(solids).render(pose, CAMERA, far=99)
+    reference = RayCaster(solids).render(pose, REALSENSE, far=99)
     same = ours.solid == reference.solid
     assert same.mean() > 0.999 and set(np.unique(ours.solid)) >= {0, 1}
     np.testing.assert_allclose(ours.depth[same], reference.depth[same], atol=1e-6)
@@ -81,7 +81,7 @@ def test_the_pose_agrees_with_the_depth_within_the_noise(brick):
         T = scene.T_camera_object
         assert scene.noise.waviness >= 0.001 and scene.noise.object_bias == 0.002
         on_object = perfect_depth(brick, scene.T_table_object, scene.frame.T_table_camera).solid == 0
-        points = unproject(scene.frame.depth, CAMERA)[on_object].astype(np.float64)
+        points = unproject(scene.frame.depth, REALSENSE)[on_object].astype(np.float64)
         points = points[np.isfinite(points).all(1)]
         outside = np.abs((points - T[:3, 3]) @ T[:3, :3] - CORNER) - SIZE / 2
         surface = np.where((outside > 0).any(1), np.linalg.norm(np.maximum(outside, 0), axis=1), -outside.max(1))

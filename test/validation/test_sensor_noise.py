@@ -10,7 +10,7 @@ from bayes3d_ros.validation.simulate.sensor_noise import (
     NO_NOISE,
     SensorNoise,
     add_sensor_noise,
-    draw_bias_field,
+    sample_bias_field,
     stereo_shadow,
 )
 
@@ -20,7 +20,7 @@ FLAT = np.ones((240, 320))
 
 def noisy(depth, noise, seed=0, cosine=FLAT):
     rng = np.random.default_rng(seed)
-    return add_sensor_noise(depth, cosine, CAMERA, noise, draw_bias_field(noise, rng), rng)
+    return add_sensor_noise(depth, cosine, CAMERA, noise, sample_bias_field(noise, rng), rng)
 
 
 def step_edge(near=0.5, far=1.0):
@@ -51,7 +51,7 @@ def test_bias_has_its_size_and_length_and_is_the_same_in_every_frame():
     noise = replace(NO_NOISE, bias=0.001, bias_length=0.05)
     rng = np.random.default_rng(0)
     origin, across = np.zeros(3), np.array([0.05, 0, 0])
-    fields = [draw_bias_field(noise, rng) for _ in range(3000)]
+    fields = [sample_bias_field(noise, rng) for _ in range(3000)]
     at = np.array([(f.at(origin), f.at(across)) for f in fields])
     assert at.std(0) == pytest.approx([1, 1], rel=0.05)
     assert np.mean(at[:, 0] * at[:, 1]) == pytest.approx(np.exp(-0.5), abs=0.06)

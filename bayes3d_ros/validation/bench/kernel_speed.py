@@ -31,11 +31,11 @@ from bayes3d_ros.validation.bench.benchmark import ycb_library, ycb_mesh
 from bayes3d_ros.validation.bench.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.validation.simulate.panning_camera import pinhole
 
-SIZES, COUNTS = (25, 50, 100, 200), (1, 256, 2048, 16384)
+TIMED_SIZES, TIMED_COUNTS = (25, 50, 100, 200), (1, 256, 2048, 16384)
 PEER_COUNT = 2048
-DISTANCE, PLACES, VOXEL = 0.6, 0.15, 0.005  # metres
-WINDOW, SIGMA, P_OUTLIER = 5, 0.003, 0.05
-NEAR, FAR, BACKGROUND = 0.1, 2.0, 1.0  # metres
+OBJECT_DISTANCE, OBJECT_SHIFT, TIMED_VOXEL = 0.6, 0.15, 0.005  # metres
+TIMED_WINDOW, TIMED_SIGMA, TIMED_P_OUTLIER = 5, 0.003, 0.05
+TIMED_NEAR, TIMED_FAR, BACKGROUND = 0.1, 2.0, 1.0  # metres
 _ROUNDS = 5  # turns that each takes
 _AT_LEAST = 0.2  # seconds of a turn: measured again until it is so long
 _MOST_REPEATS = 7  # in a turn
@@ -55,14 +55,14 @@ class Workload(NamedTuple):
 def poses(count: int, centre: Float[np.ndarray, "3"], seed: int = 0) -> Float[np.ndarray, "N 4 4"]:
     """T_camera_object of upright objects whose middle lies at the camera's height."""
     rng = np.random.default_rng(seed)
-    yaw, place = rng.uniform(0, 2 * np.pi, count), rng.uniform(-PLACES, PLACES, (count, 2))
+    yaw, place = rng.uniform(0, 2 * np.pi, count), rng.uniform(-OBJECT_SHIFT, OBJECT_SHIFT, (count, 2))
     T = np.zeros((count, 4, 4))
     # The camera looks along the object's y axis at yaw 0; its image is upright.
     T[:, 0, 0], T[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
     T[:, 1, 2] = -1.0
     T[:, 2, 0], T[:, 2, 1] = np.sin(yaw), np.cos(yaw)
     T[:, 3, 3] = 1.0
-    middle = np.stack([place[:, 0], np.zeros(count), DISTANCE + place[:, 1]], 1)
+    middle = np.stack([place[:, 0], np.zeros(count), OBJECT_DISTANCE + place[:, 1]], 1)
     T[:, :3, 3] = middle - T[:, :3, :3] @ centre
     return T
 
@@ -75,7 +75,7 @@ def workload(size: int, count: int, library_folder: Path) -> Workload:
     pair = (jnp.asarray(rays[..., 0], jnp.float32), jnp.asarray(rays[..., 1], jnp.float32))
     depth = np.asarray(march(arrays, jnp.int32(0), jnp.asarray(T[0], jnp.float32), pair))
     depth = np.where(np.isfinite(depth), depth, BACKGROUND)
-    depth = depth + SIGMA * np.random.default_rng(1).normal(size=depth.shape)
+    depth = depth + TIMED_SIGMA * np.random.default_rng(1).normal(size=depth.shape)
     image = ScoredImage(
         depth=jnp.asarray(depth, jnp.float32),
         pixel_class=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
@@ -84,7 +84,7 @@ def workload(size: int, count: int, library_folder: Path) -> Workload:
         focal=jnp.array([camera.fx, camera.fy], jnp.float32),
         centre=jnp.array([camera.cx, camera.cy], jnp.float32),
         bare_depth=jnp.full(depth.shape, jnp.inf),
-        outlier_scale=jnp.float32(3 / (FAR**3 - NEAR**3)),
+        outlier_scale=jnp.float32(3 / (TIMED_FAR**3 - TIMED_NEAR**3)),
         front_margin=jnp.float32(0.01),
     )
     return Workload(T.astype(np.float32), image, arrays, rays)
@@ -92,12 +92,12 @@ def workload(size: int, count: int, library_folder: Path) -> Workload:
 
 def noise() -> Noise:
     """The one pair of noise values."""
-    return Noise(jnp.array([SIGMA]), jnp.array([P_OUTLIER]))
+    return Noise(jnp.array([TIMED_SIGMA]), jnp.array([TIMED_P_OUTLIER]))
 
 
 def _both(T, image: ScoredImage, library: LibraryArrays):
     world = World(jnp.zeros(1, jnp.int32), jnp.eye(4)[None], jnp.asarray(False))
-    return log_likelihood_of_cameras(T, world, image, library, noise(), WINDOW)[:, 0, 0]
+    return log_likelihood_of_cameras(T, world, image, library, noise(), TIMED_WINDOW)[:, 0, 0]
 
 
 def _render(T, image: ScoredImage, library: LibraryArrays):
@@ -110,12 +110,12 @@ OURS: dict[str, Callable] = {"render": _render, "render+score": _both}
 
 def cases() -> list[tuple[str, str, int, int]]:
     """what, backend, size and hypotheses of every row."""
-    return [case for size in SIZES for case in _compared(size)]
+    return [case for size in TIMED_SIZES for case in _compared(size)]
 
 
 def _compared(size: int) -> list[tuple[str, str, int, int]]:
     """The rows that are measured in turn."""
-    own = [(what, "ours", size, number) for number in COUNTS for what in (*OURS, "score")]
+    own = [(what, "ours", size, number) for number in TIMED_COUNTS for what in (*OURS, "score")]
     casters = [("render", name, size, PEER_COUNT) for name in peers.installed()]
     return [*own, *casters, ("render+score", "plain-jax", size, at_once(size))]
 
@@ -135,8 +135,8 @@ def rows() -> Iterator[SpeedRow]:
     name = "006_mustard_bottle"
     mesh = load_mesh(ycb_mesh(name))
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
-        ycb_library((name,), Path(folder), VOXEL)
-        for size in SIZES:
+        ycb_library((name,), Path(folder), TIMED_VOXEL)
+        for size in TIMED_SIZES:
             compared = _compared(size)
             works = {number: workload(size, number, Path(folder)) for number in {case[3] for case in compared}}
             turns = {case: _turn(case, works[case[3]], mesh) for case in compared if case[0] != "score"}
@@ -186,7 +186,7 @@ def _ours(what: str, work: Workload) -> Callable[[], Any]:
 
 def _plain(work: Workload) -> Callable[[], Any]:
     T = jnp.asarray(work.T_camera_object)
-    return lambda: jax.block_until_ready(peers.plain_log_likelihood(T, work.image, work.library, noise(), WINDOW))
+    return lambda: jax.block_until_ready(peers.plain_log_likelihood(T, work.image, work.library, noise(), TIMED_WINDOW))
 
 
 def _cast(scene: peers.Caster, work: Workload) -> float:

@@ -12,7 +12,7 @@ from bayes3d_ros.validation.bench.speed_rows import SpeedRow, speed_row
 from bayes3d_ros.validation.experiments.camera_tracking import OBJECTS, Recordings, track_row
 
 CASES = ((25, 512), (25, 2048), (100, 2048))  # pixels across, hypotheses
-FRAMES = 12
+TIMED_FRAMES = 12
 HEADER = f"{'what':<13} {'size':>4} {'hypotheses':>10} {'FPS':>7} {'seconds':>9}"
 
 
@@ -25,7 +25,7 @@ def rows() -> Iterator[SpeedRow]:
     """The mustard bottle's first frames from the independent renderer (`evaluate camera-tracking`)."""
     thing = next(iter(OBJECTS))
     with tempfile.TemporaryDirectory(prefix="bayes3d-bench-") as folder:
-        recordings = Recordings(load_library(ycb_library((OBJECTS[thing],), Path(folder))), FRAMES)
+        recordings = Recordings(load_library(ycb_library((OBJECTS[thing],), Path(folder))), TIMED_FRAMES)
     for size, hypotheses in CASES:
         fps = track_row(recordings, thing, size, "independent", hypotheses)["fps"]
         yield speed_row("track", "ours", jax.devices()[0].platform, size, hypotheses, [1 / fps], fps=fps)

@@ -22,13 +22,13 @@ from bayes3d_ros.validation.reference.calibration_problem import (
     sample,
     small_problem,
 )
-from bayes3d_ros.validation.reference.prior_predictive import draw_noise, draw_scene
+from bayes3d_ros.validation.reference.prior_predictive import sample_noise, sample_scene
 from bayes3d_ros.validation.statistics.credible_regions import coverage, quantiles
 from bayes3d_ros.validation.statistics.ranks import brier, effective_size, rank, uniformity
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-SCENES, QUICK_SCENES = 1000, 32
+CALIBRATION_SCENES, QUICK_CALIBRATION_SCENES = 1000, 32
 SEED = 11  # not one that the sampler was tuned on (4)
 LATENTS = ("n", "x", "y", "yaw", "sigma", "p_outlier", "log_likelihood")
 OBJECT = ("x", "y", "yaw")  # of the object with the smallest x, given that there is an object; yaw is cut at 0
@@ -50,7 +50,7 @@ def notes(quick: bool) -> list[str]:
 
 def count(quick: bool) -> int:
     """How many scenes there are."""
-    return QUICK_SCENES if quick else SCENES
+    return QUICK_CALIBRATION_SCENES if quick else CALIBRATION_SCENES
 
 
 def steps(quick: bool) -> Iterator[list[Row]]:
@@ -65,8 +65,8 @@ def scene_row(k: int, problem: CalibrationProblem, sigma_error: float = 1.0) -> 
     the images are noisier than the truth says: what calibration must find."""
     scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SEED), k))
     rng = np.random.default_rng((SEED, k))
-    objects, number = draw_scene(scene_key, problem.log_count, problem.library, problem.table)
-    sigma, p_outlier = draw_noise(rng, problem.grid)
+    objects, number = sample_scene(scene_key, problem.log_count, problem.library, problem.table)
+    sigma, p_outlier = sample_noise(rng, problem.grid)
     surface = render(objects, number, problem)
     image = observe(rng, surface, (sigma_error * sigma, p_outlier), problem)
     start = time.perf_counter()
@@ -175,18 +175,18 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         ranks = [row["rank"][name] for row in own]
         tests = uniformity(ranks)
         p_values += tests
-        told[name] = {"scenes": len(own), **_rounded(tests._asdict())}
+        told[name] = {"scenes": len(own), **_rounded_values(tests._asdict())}
         if name in ("n", "log_likelihood"):
             continue
         for nominal in (0.5, 0.9):
             held = coverage([abs(2 * r - 1) for r in ranks], nominal)
             percent = f"{100 * nominal:.0f}"
-            told[name] |= _rounded({f"coverage_{percent}": held.share, f"error_{percent}": held.error})
+            told[name] |= _rounded_values({f"coverage_{percent}": held.share, f"error_{percent}": held.error})
             if abs(held.share - nominal) > 3 * held.error:
                 uncovered.append(f"{name} {percent} %")
         low, high = np.quantile([row["truth"][name] for row in own], (0.05, 0.95))
         width = np.mean([row["width_90"][name] for row in own])
-        told[name] |= _rounded({"width": float(width / max(high - low, 1e-9))})
+        told[name] |= _rounded_values({"width": float(width / max(high - low, 1e-9))})
     for name in PROBABILITIES:
         own = [row for row in rows if row[name] is not None]
         if own:
@@ -194,12 +194,12 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             probabilities, outcomes = ([row[key] for row in own] for key in (f"p_{name}", name))
             test = brier(np.array(probabilities), np.array(outcomes), np.array(sizes))
             p_values.append(test.p_value)
-            told[f"p({name})"] = {"scenes": len(own), **_rounded(test._asdict())}
+            told[f"p({name})"] = {"scenes": len(own), **_rounded_values(test._asdict())}
     told["tests"] = {"number": len(p_values), "rejected_below": LEVEL / len(p_values), "smallest_p": min(p_values)}
-    told["tests"] = {**_rounded(told["tests"]), "not_covered": uncovered}
+    told["tests"] = {**_rounded_values(told["tests"]), "not_covered": uncovered}
     told["calibrated"] = bool(min(p_values) >= LEVEL / len(p_values) and not uncovered)
     return told
 
 
-def _rounded(numbers: dict[str, float]) -> dict[str, float]:
+def _rounded_values(numbers: dict[str, float]) -> dict[str, float]:
     return {name: float(f"{value:.4g}") for name, value in numbers.items()}

@@ -12,13 +12,13 @@ from bayes3d_ros.validation.reference.calibration_problem import SETTINGS, small
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-SCENES, QUICK_SCENES = 400, 40
+POINT_SCENES, QUICK_POINT_SCENES = 400, 40
 POINTS = replace(SETTINGS, likelihood="points", sigma_max=0.002)
 
 
 def count(quick: bool) -> int:
     """How many scenes there are."""
-    return QUICK_SCENES if quick else SCENES
+    return QUICK_POINT_SCENES if quick else POINT_SCENES
 
 
 def steps(quick: bool) -> Iterator[list[Row]]:

@@ -35,9 +35,9 @@ OBJECTS: dict[str, str] = {
     "power_drill": "035_power_drill",
     "large_clamp": "051_large_clamp",
 }
-SIZES = (25, 50, 100, 200)
+TRACKED_SIZES = (25, 50, 100, 200)
 HYPOTHESES, FEWER = 2048, (512, 1024)
-FRAMES, QUICK_FRAMES = 120, 10
+TRACKED_FRAMES, QUICK_TRACKED_FRAMES = 120, 10
 FRAMES_OF = ("own", "independent")
 MEASURED = ("fps", "position_cm", "orientation_deg")
 # These on their GPU with a score of plain depth differences (Bayes3D, its tracking table).
@@ -63,7 +63,7 @@ HEADER = (
 
 def _cases(quick: bool) -> list[tuple[str, int, str, int]]:
     """Object, size, frames, hypotheses of every row; the largest images, which take longest, last."""
-    sizes = (25, 100) if quick else SIZES
+    sizes = (25, 100) if quick else TRACKED_SIZES
     table = [(thing, size, frames, HYPOTHESES) for size in sizes for thing in OBJECTS for frames in FRAMES_OF]
     fewer = [(thing, 25, "independent", hypotheses) for hypotheses in FEWER for thing in OBJECTS]
     return table if quick else fewer + table
@@ -71,7 +71,7 @@ def _cases(quick: bool) -> list[tuple[str, int, str, int]]:
 
 def notes(quick: bool) -> list[str]:
     """Says what a quick run leaves out."""
-    return [f"quick: {QUICK_FRAMES} frames in place of {FRAMES}, 25 and 100 pixels"] if quick else []
+    return [f"quick: {QUICK_TRACKED_FRAMES} frames in place of {TRACKED_FRAMES}, 25 and 100 pixels"] if quick else []
 
 
 def count(quick: bool) -> int:
@@ -83,7 +83,7 @@ def steps(quick: bool) -> Iterator[list[Row]]:
     """A row each: all frames tracked in turn."""
     with TemporaryDirectory(prefix="bayes3d-tracking-") as folder:
         library = load_library(ycb_library(tuple(OBJECTS.values()), Path(folder)))
-    recordings = Recordings(library, QUICK_FRAMES if quick else FRAMES)
+    recordings = Recordings(library, QUICK_TRACKED_FRAMES if quick else TRACKED_FRAMES)
     for case in _cases(quick):
         yield [track_row(recordings, *case)]
 
@@ -209,7 +209,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
                       label=f"{thing}, paper")  # fmt: skip
         axis.set_xscale("log")
         axis.set_yscale("log")
-        axis.set_xticks(SIZES, [str(size) for size in SIZES])
+        axis.set_xticks(TRACKED_SIZES, [str(size) for size in TRACKED_SIZES])
         axis.minorticks_off()
         axis.set_xlabel("pixels across", color=INK)
         axis.set_title(title, loc="left", fontsize=10, color=INK)

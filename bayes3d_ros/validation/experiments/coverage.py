@@ -17,7 +17,7 @@ from bayes3d_ros.validation.bench.benchmark import ycb_library
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.coverage_plot import plot
 from bayes3d_ros.validation.simulate.random_scenes import (
-    CAMERA,
+    REALSENSE,
     RandomScene,
     RestingObject,
     random_scene,
@@ -46,12 +46,12 @@ NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
     ("offset an object", ParserSettings(depth_waviness=0.0)),
     ("smooth field", ParserSettings()),
 )
-TYPES: tuple[str, ...] = tuple(SYMMETRIES)
-SCENES, QUICK_SCENES = 400, 40
-NEAR = 0.1  # metres: an estimate farther off is another thing's
+COVERED_TYPES: tuple[str, ...] = tuple(SYMMETRIES)
+COVERAGE_SCENES, QUICK_COVERAGE_SCENES = 400, 40
+SAME_THING_WITHIN = 0.1  # metres: an estimate farther off is another thing's
 SAME_REST = np.radians(10.0)  # samples tipped farther stand on another face
 # Quantities: x and y on the table; `range` and `across`, the same along and across the camera's view; then regions.
-QUANTITIES = ("x", "y", "range", "across", "yaw", "position", "pose")
+COVERED_QUANTITIES = ("x", "y", "range", "across", "yaw", "position", "pose")
 HEADER = (
     f"{'scene':>5} {'type':<20} {'model':<20} {'ESS':>5} {'rest':>5}  "
     f"{'error mm':>8} {'width90':>8} {'level':>5}  {'yaw deg':>8} {'width90':>8} {'level':>5}  {'s':>5}"
@@ -65,23 +65,23 @@ def notes(quick: bool) -> list[str]:
 
 def count(quick: bool) -> int:
     """How many scenes there are."""
-    return QUICK_SCENES if quick else SCENES
+    return QUICK_COVERAGE_SCENES if quick else COVERAGE_SCENES
 
 
 def steps(quick: bool) -> Iterator[list[Row]]:
     """The rows of every scene, one a noise model. Scene k is the same whatever their number."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-coverage-") as folder:
-        libraries = {name: load_library(ycb_library((name,), Path(folder) / name)) for name in TYPES}
-    objects = {name: resting(libraries[name]) for name in TYPES}
+        libraries = {name: load_library(ycb_library((name,), Path(folder) / name)) for name in COVERED_TYPES}
+    objects = {name: resting(libraries[name]) for name in COVERED_TYPES}
     parsers: dict[tuple[str, str], SceneParser] = {}
     for k in range(count(quick)):
-        name = TYPES[k % len(TYPES)]
+        name = COVERED_TYPES[k % len(COVERED_TYPES)]
         scene = random_scene(objects[name], k)
         rows = []
         for label, settings in NOISE_MODELS:
             if (label, name) not in parsers:
                 parsers[label, name] = SceneParser(libraries[name], settings)
-                parsers[label, name].warm_up(CAMERA.width, CAMERA.height)
+                parsers[label, name].warm_up(REALSENSE.width, REALSENSE.height)
             rows.append(scene_row(k, label, scene, parsers[label, name]))
         yield rows
 
@@ -108,7 +108,7 @@ def scene_row(k: int, label: str, scene: RandomScene, parser: SceneParser) -> Ro
     row |= dict.fromkeys(
         ("probability", "ess_min", "samples_ess", "right_rest", "sigma", "objects", "seconds", "error")
     )
-    row |= dict.fromkeys(QUANTITIES)
+    row |= dict.fromkeys(COVERED_QUANTITIES)
     try:
         posterior = parser.parse(scene.frame)
     except ParseError as error:
@@ -137,7 +137,7 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
     for j, estimate in enumerate(posterior.objects):
         here = Rotation.from_quat(estimate.orientation).apply(centre) + estimate.position
         near.append((float(np.linalg.norm(to_table @ here + camera - true)), j))
-    if not near or min(near)[0] > NEAR:
+    if not near or min(near)[0] > SAME_THING_WITHIN:
         return {}
     sample, slot = np.nonzero(posterior.object_index == min(near)[1])
     weights = np.exp(samples.log_weight[sample].astype(float))
@@ -198,7 +198,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             "samples_ess": _mean([row["samples_ess"] for row in found]),
             "seconds": _mean([row["seconds"] for row in found]),
         }
-        for name in QUANTITIES:
+        for name in COVERED_QUANTITIES:
             able = [row for row in own if name not in ("yaw", "pose") or SYMMETRIES[row["type"]].has_yaw]
             if able:
                 told[f"{label}: {name}"] = quantity(name, able)

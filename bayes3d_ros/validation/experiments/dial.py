@@ -22,10 +22,10 @@ from bayes3d_ros.validation.experiments import Row
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-PARTICLES, QUICK_PARTICLES = (24, 48, 96, 192, 384), (24, 96)
-SEEDS, QUICK_SEEDS = 8, 3
+DIAL_PARTICLES, QUICK_DIAL_PARTICLES = (24, 48, 96, 192, 384), (24, 96)
+DIAL_SEEDS, QUICK_DIAL_SEEDS = 8, 3
 BAGS = ("one_object", "three_objects")
-TYPES = ("003_cracker_box", "004_sugar_box", "006_mustard_bottle", "025_mug")
+DIAL_TYPES = ("003_cracker_box", "004_sugar_box", "006_mustard_bottle", "025_mug")
 HEADER = f"{'recording':<14} {'particles':>9} {'seed':>4} {'seconds':>8} {'log Z':>10} {'ESS >=':>7} {'p(n)':>6}"
 
 
@@ -33,23 +33,24 @@ def notes(quick: bool) -> list[str]:
     """Says what a quick run leaves out."""
     if not quick:
         return []
-    return [f"quick: {QUICK_PARTICLES} particles and {QUICK_SEEDS} seeds in place of {PARTICLES} and {SEEDS}"]
+    used = f"{QUICK_DIAL_PARTICLES} particles and {QUICK_DIAL_SEEDS} seeds"
+    return [f"quick: {used} in place of {DIAL_PARTICLES} and {DIAL_SEEDS}"]
 
 
 def count(quick: bool) -> int:
     """A step is a number of particles on a recording."""
-    return len(BAGS) * len(QUICK_PARTICLES if quick else PARTICLES)
+    return len(BAGS) * len(QUICK_DIAL_PARTICLES if quick else DIAL_PARTICLES)
 
 
 def steps(quick: bool) -> Iterator[list[Row]]:
     """The first frame of each recording, every seed; compiled beforehand."""
     with TemporaryDirectory() as folder:
-        library = load_library(ycb_library(TYPES, Path(folder)))
-    for particles in QUICK_PARTICLES if quick else PARTICLES:
+        library = load_library(ycb_library(DIAL_TYPES, Path(folder)))
+    for particles in QUICK_DIAL_PARTICLES if quick else DIAL_PARTICLES:
         for bag in BAGS:
             frame = next(iter(read_frames(share_directory() / "bags" / bag)))
             rows = []
-            for seed in range(QUICK_SEEDS if quick else SEEDS):
+            for seed in range(QUICK_DIAL_SEEDS if quick else DIAL_SEEDS):
                 parser = SceneParser(library, ParserSettings(particles=particles, seed=seed))
                 if seed == 0:
                     parser.parse(frame)

@@ -29,11 +29,11 @@ from bayes3d_ros.validation.statistics.ranks import effective_size
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-PARTICLES, ESS_THRESHOLD = 1000, 0.5
-SEEDS, QUICK_SEEDS = 50, 8
+RUN_PARTICLES, ESS_THRESHOLD = 1000, 0.5
+RUNS, QUICK_RUNS = 50, 8
 QUICK_PROBLEMS = ("handle seen", "handle hidden")
-QUANTITIES = ("type", "face", "yaw")  # whose distributions are compared
-PLACES, SHARES = ("x", "y", "yaw"), (0.5, 0.9)  # whose regions are
+COMPARED_QUANTITIES = ("type", "face", "yaw")  # whose distributions are compared
+REGION_QUANTITIES, SHARES = ("x", "y", "yaw"), (0.5, 0.9)  # whose regions are
 # What a problem's summary must keep to: at most, and runs within their limit at least.
 MOVES, ERRORS_OFF, RMS_LOG, TV, WIDTH, WITHIN = 0.02, 3.0, 0.3, 0.1, 1.2, 1.0
 HEADER = (
@@ -51,7 +51,7 @@ class Run(NamedTuple):
     ess: float  # of those, not divided by N; what descends from one draw counts once; of the slot with the fewest
 
 
-def run(problem: SmallProblem, seed: int, particles: int = PARTICLES, step: Callable = smc.step) -> Run:
+def run(problem: SmallProblem, seed: int, particles: int = RUN_PARTICLES, step: Callable = smc.step) -> Run:
     """As many stages as the problem has true objects. All that is asked of the sampler stands here."""
     objects, key = len(problem.truth.type), jax.random.key(seed)
     state = smc.init(problem.context, problem.grid, particles, problem.max_objects, problem.table_size, problem.window)
@@ -84,7 +84,7 @@ def notes(quick: bool) -> list[str]:
     """Says what a quick run leaves out."""
     if not quick:
         return []
-    return [f"quick: {', '.join(QUICK_PROBLEMS)} only, {QUICK_SEEDS} seeds in place of {SEEDS}"]
+    return [f"quick: {', '.join(QUICK_PROBLEMS)} only, {QUICK_RUNS} seeds in place of {RUNS}"]
 
 
 def _names(quick: bool) -> tuple[str, ...]:
@@ -93,7 +93,7 @@ def _names(quick: bool) -> tuple[str, ...]:
 
 def count(quick: bool) -> int:
     """Every problem is enumerated, then sampled with every seed."""
-    return len(_names(quick)) * (1 + (QUICK_SEEDS if quick else SEEDS))
+    return len(_names(quick)) * (1 + (QUICK_RUNS if quick else RUNS))
 
 
 def steps(quick: bool) -> Iterator[list[Row]]:
@@ -102,7 +102,7 @@ def steps(quick: bool) -> Iterator[list[Row]]:
         problem = PROBLEMS[name]()
         exact = reference_row(problem)
         yield [exact]
-        for seed in range(QUICK_SEEDS if quick else SEEDS):
+        for seed in range(QUICK_RUNS if quick else RUNS):
             yield [seed_row(problem, exact, seed)]
 
 
@@ -150,7 +150,7 @@ def seed_row(problem: SmallProblem, exact: Row, seed: int) -> Row:
         "marginals": {name: _rounded(values) for name, values in said.items()},
         "seconds": round(seconds, 3),
     }
-    for name in QUANTITIES:
+    for name in COMPARED_QUANTITIES:
         truth = binned(name, exact["marginals"][name])
         row[f"tv_{name}"] = round(total_variation(binned(name, said[name]), truth), 5)
         row[f"limit_{name}"] = round(1.5 * noise_floor(truth, result.ess), 5)
@@ -205,7 +205,7 @@ def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
     }
     weight, true = evidence_weights(log_z), exact["marginals"]
     mixed = {name: weight @ np.array([row["marginals"][name] for row in seeds]) for name in true}
-    for name in QUANTITIES:
+    for name in COMPARED_QUANTITIES:
         told[f"tv_{name}"] = round(total_variation(binned(name, mixed[name]), binned(name, true[name])), 4)
         told[f"within_{name}"] = round(float(np.mean([row[f"tv_{name}"] <= row[f"limit_{name}"] for row in seeds])), 3)
     # p(n) of the mean evidence of every number of objects: each is unbiased.
@@ -213,7 +213,7 @@ def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
     p_n = number_of_objects(log_mean([row["log_evidence"] for row in seeds]), exact["count_ratio"])
     told |= {"tv_n": round(total_variation(p_n, exact["num_objects"]), 4), "worst_tv_n": round(max(each), 4)}
     told |= {"width": {}, "exact_mass": {}}
-    for name in PLACES:
+    for name in REGION_QUANTITIES:
         for share in SHARES:
             width, mass = region_against(mixed[name], true[name], share)
             told["width"][f"{name}_{100 * share:.0f}"] = round(width, 3)
@@ -223,8 +223,9 @@ def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
 
 def not_met(told: Row) -> list[str]:
     """What of a problem's summary misses the limits above."""
-    limits = {"halving_moves": MOVES, "rms_log": RMS_LOG, "tv_n": TV, **{f"tv_{name}": TV for name in QUANTITIES}}
+    limits = {"halving_moves": MOVES, "rms_log": RMS_LOG, "tv_n": TV}
+    limits |= {f"tv_{name}": TV for name in COMPARED_QUANTITIES}
     missed = [name for name, limit in limits.items() if told[name] > limit]
     missed += ["mean"] * (told["errors_off"] is not None and abs(told["errors_off"]) > ERRORS_OFF)
-    missed += [f"within_{name}" for name in QUANTITIES if told[f"within_{name}"] < WITHIN]
+    missed += [f"within_{name}" for name in COMPARED_QUANTITIES if told[f"within_{name}"] < WITHIN]
     return missed + [f"width {name}" for name, ratio in told["width"].items() if ratio > WIDTH]

@@ -25,16 +25,16 @@ from bayes3d_ros.validation.bench.benchmark import ycb_mesh
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.parsing import Surfaces, estimated_pose
 from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors
-from bayes3d_ros.validation.simulate.random_scenes import CAMERA, RestingObject, resting_object
+from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, RestingObject, resting_object
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster
 from bayes3d_ros.validation.simulate.resting import placed, rest_rotation
-from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
 from bayes3d_ros.validation.statistics.metrics import add_s
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
 # Where each stands in the scene that is parsed: x, y in metres, yaw in degrees; they were learned at yaw 25.
-PLACES = {
+OBJECT_PLACES = {
     "003_cracker_box": (0.02, 0.20, 70.0),
     "006_mustard_bottle": (-0.20, 0.03, -40.0),
     "025_mug": (0.21, 0.02, 130.0),
@@ -43,7 +43,7 @@ PLACES = {
 LEARNED_YAW = 25.0
 VIEWS, QUICK_VIEWS = (1, 2, 3, 5, 8), (5,)
 POSE_NOISE = {"exact": (0.0, 0.0), "1 cm, 1 deg": (0.01, float(np.radians(1.0)))}
-VOXEL = 0.005
+LEARNED_VOXEL = 0.005
 HEADER = (
     f"{'object':<20} {'views':>5} {'camera poses':<12} {'median mm':>9} {'95 % mm':>8} {'covered':>8} {'seconds':>8} "
     f"{'p(type)':>8} {'ADD-S mm':>9}"
@@ -63,22 +63,22 @@ def count(quick: bool) -> int:
 def steps(quick: bool) -> Iterator[list[Row]]:
     """Learn every object, then parse one scene of all of them with these models alone."""
     surfaces = Surfaces()
-    things = {name: _thing(name) for name in PLACES}
-    scene = _scene(things)
-    learn(capture(things["025_mug"], _pose(things["025_mug"], 0, 0, 0), 1, (0.0, 0.0), 0).frames, "warm_up")
+    things = {name: _thing(name) for name in OBJECT_PLACES}
+    scene = _scene_frame(things)
+    learn(capture(things["025_mug"], _resting_pose(things["025_mug"], 0, 0, 0), 1, (0.0, 0.0), 0).frames, "warm_up")
     for views in QUICK_VIEWS if quick else VIEWS:
         for poses, pose_noise in POSE_NOISE.items():
             models, rows = {}, []
             for seed, (name, thing) in enumerate(things.items()):
-                T_table_object = _pose(thing, 0.0, 0.0, LEARNED_YAW)
+                T_table_object = _resting_pose(thing, 0.0, 0.0, LEARNED_YAW)
                 captures = capture(thing, T_table_object, views, pose_noise, seed)
                 start = time.perf_counter()
-                learned = learn(captures.frames, name, LearnerSettings(voxel_size=VOXEL))
+                learned = learn(captures.frames, name, LearnerSettings(voxel_size=LEARNED_VOXEL))
                 seconds = time.perf_counter() - start
                 errors = shape_errors(learned, captures, thing.mesh, aligned=poses != "exact")
                 models[name] = learned, np.linalg.inv(learned.T_table_object) @ T_table_object
                 rows.append(
-                    {"object": name, "views": views, "camera_poses": poses, "voxel_size": VOXEL}
+                    {"object": name, "views": views, "camera_poses": poses, "voxel_size": LEARNED_VOXEL}
                     | {key: round(value, 6) for key, value in errors._asdict().items()}
                     | {"coverage": round(learned.coverage, 4), "seconds": round(seconds, 3)}
                 )
@@ -90,22 +90,22 @@ def _thing(name: str) -> RestingObject:
     return resting_object(name, load_mesh(ycb_mesh(name)))
 
 
-def _pose(thing: RestingObject, x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
+def _resting_pose(thing: RestingObject, x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
     """T_table_object of the upright mesh, its bounding box's middle at x, y."""
     rotation = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rest_rotation(thing.mesh, "upright")
     return placed(thing.mesh, rotation, np.array([x, y]))
 
 
-def _scene(things: dict[str, RestingObject]) -> DepthFrame:
+def _scene_frame(things: dict[str, RestingObject]) -> DepthFrame:
     """All of them on one table."""
     table = np.eye(4)
     table[2, 3] = -0.015
-    solids: list[Any] = [(thing.mesh, _pose(thing, *PLACES[name])) for name, thing in things.items()]
+    solids: list[Any] = [(thing.mesh, _resting_pose(thing, *OBJECT_PLACES[name])) for name, thing in things.items()]
     T_table_camera = look_at(np.array([0.05, -0.62, 0.5]), np.array([0.0, 0.03, 0.05]))
-    clean = RayCaster([*solids, (Box((1.2, 0.8, 0.03)), table)]).render(T_table_camera, CAMERA)
+    clean = RayCaster([*solids, (Box((1.2, 0.8, 0.03)), table)]).render(T_table_camera, REALSENSE)
     rng, noise = np.random.default_rng(5), SensorNoise()
-    depth = add_sensor_noise(clean.depth, clean.cosine, CAMERA, noise, draw_bias_field(noise, rng), rng)
-    return DepthFrame(depth.astype(np.float32), CAMERA, 10**9, "camera", T_table_camera)
+    depth = add_sensor_noise(clean.depth, clean.cosine, REALSENSE, noise, sample_bias_field(noise, rng), rng)
+    return DepthFrame(depth.astype(np.float32), REALSENSE, 10**9, "camera", T_table_camera)
 
 
 def _parse(
@@ -120,7 +120,7 @@ def _parse(
     assert scene.T_table_camera is not None
     for row in rows:
         name = row["object"]
-        T_true = np.linalg.inv(scene.T_table_camera) @ _pose(things[name], *PLACES[name])
+        T_true = np.linalg.inv(scene.T_table_camera) @ _resting_pose(things[name], *OBJECT_PLACES[name])
         found = []
         for estimate in posterior.objects:
             if estimate.type == name:
@@ -175,7 +175,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         "add_s": "ADD-S in a scene (gaps: not found), mm",
     }
     for axis, (key, title) in zip(axes, titles.items(), strict=True):
-        for k, name in enumerate(PLACES):
+        for k, name in enumerate(OBJECT_PLACES):
             for style, poses in zip(("o-", "s--"), POSE_NOISE, strict=True):
                 own = sorted(
                     (row["views"], row[key]) for row in rows if row["object"] == name and row["camera_poses"] == poses

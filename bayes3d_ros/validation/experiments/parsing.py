@@ -33,7 +33,7 @@ TWENTY_ONE_TYPES: tuple[str, ...] = tuple(sorted((
     *TEN_TYPES, "002_master_chef_can", "007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "021_bleach_cleanser",
     "036_wood_block", "037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick",
 )))  # fmt: skip
-SURFACE_POINTS = 20_000  # less than 3 mm apart on the largest of these meshes
+ADD_S_POINTS = 20_000  # less than 3 mm apart on the largest of these meshes
 REGION = float(np.sqrt(chi2.ppf(0.95, 3)))  # standard deviations that hold 95 % of a Gaussian in 3D
 HEADER = (
     f"{'recording, its objects':<36} {'visible':>7} {'p(exists)':>9} {'p(type)':>8} "
@@ -114,7 +114,7 @@ class Surfaces:
         """In the mesh's frame, metres."""
         if type_name not in self._points:
             mesh = load_mesh(ycb_mesh(type_name))
-            self._points[type_name] = np.asarray(trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0])
+            self._points[type_name] = np.asarray(trimesh.sample.sample_surface(mesh, ADD_S_POINTS, seed=0)[0])
         return self._points[type_name]
 
 

@@ -24,7 +24,7 @@ from bayes3d_ros.validation.experiments.parsing import notes, recordings
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
-SEEDS = (0, 1)
+TWO_SEEDS = (0, 1)
 # What two runs of a frame must keep to: effective share of the particles, standard deviations, probability.
 LEAST_ESS, APART, TYPE_APART = 0.1, 1.0, 0.05
 HEADER = (
@@ -44,7 +44,7 @@ def steps(quick: bool) -> Iterator[list[Row]]:
     chosen = recordings(quick=True)
     with tempfile.TemporaryDirectory(prefix="bayes3d-repeatability-") as folder:
         library = load_library(ycb_library(chosen[0].types, Path(folder)))
-        parsers = [SceneParser(library, ParserSettings(seed=seed)) for seed in SEEDS]
+        parsers = [SceneParser(library, ParserSettings(seed=seed)) for seed in TWO_SEEDS]
         for recording in chosen:
             for frame in islice(read_frames(recording.bag), 1 if quick else None):
                 yield [frame_row(recording.bag.name, *(parser.parse(frame) for parser in parsers))]
@@ -61,9 +61,9 @@ def frame_row(bag: str, first: ScenePosterior, second: ScenePosterior) -> Row:
         "frame": first.stamp_ns,
         "objects": [len(first.objects), len(second.objects)],
         "ess": [[round(float(share), 4) for share in run.ess] for run in (first, second)],
-        "means_apart": None if indices is None else _worst(_means_apart(first, i, second, j) for i, j in indices),
-        "poses_apart": None if pairs is None else _worst(_poses_apart(a, b) for a, b in pairs),
-        "type_apart": None if pairs is None else _worst(_type_apart(a, b) for a, b in pairs),
+        "means_apart": None if indices is None else _worst_gap(_means_apart(first, i, second, j) for i, j in indices),
+        "poses_apart": None if pairs is None else _worst_gap(_poses_apart(a, b) for a, b in pairs),
+        "type_apart": None if pairs is None else _worst_gap(_type_apart(a, b) for a, b in pairs),
         "count_apart": round(max(abs(first.num_objects.get(n, 0) - second.num_objects.get(n, 0)) for n in names), 5),
         "log_evidence": [round(run.log_evidence, 3) for run in (first, second)],
     }
@@ -78,7 +78,7 @@ def matched(first: Sequence[ObjectEstimate], second: Sequence[ObjectEstimate]) -
     return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
-def _worst(differences: Iterator[float]) -> float:
+def _worst_gap(differences: Iterator[float]) -> float:
     return round(max(differences, default=0.0), 5)
 
 

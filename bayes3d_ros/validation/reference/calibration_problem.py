@@ -26,12 +26,13 @@ from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.reference.prior_predictive import DepthRange, draw_depth, draw_points
+from bayes3d_ros.validation.reference.prior_predictive import DepthRange, sample_depth, sample_points
 
-CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
+CALIBRATION_CAMERA = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 NEGLIGIBLE = 10.0  # nats: scenes of so much less weight are left as they are
-DISTANCE, TILT = 0.6, np.pi / 4  # of the camera from the table's middle in metres, and of its view below the horizon
-VOXEL = 0.005
+CAMERA_DISTANCE = 0.6  # of the camera from the table's middle, metres
+CAMERA_TILT = np.pi / 4  # of its view below the horizon
+CALIBRATION_VOXEL = 0.005
 SETTINGS = ParserSettings(
     max_objects=2,
     count_ratio=1.0,
@@ -76,14 +77,14 @@ def small_library() -> Library:
     wall, handle = trimesh.creation.annulus(0.028, 0.038, 0.09), trimesh.creation.box((0.03, 0.012, 0.05))
     handle.apply_translation((0.05, 0, 0))
     shapes = {"brick": trimesh.creation.box((0.05, 0.07, 0.10)), "mug": trimesh.util.concatenate([wall, handle])}
-    return Library(tuple(model_from_mesh(shape, name, VOXEL) for name, shape in shapes.items()))
+    return Library(tuple(model_from_mesh(shape, name, CALIBRATION_VOXEL) for name, shape in shapes.items()))
 
 
 def small_problem(settings: ParserSettings = SETTINGS) -> CalibrationProblem:
     """The library on a table seen from above by half a right angle."""
-    c, s = np.cos(TILT), np.sin(TILT)
-    T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, DISTANCE], [0, 0, 0, 1]])
-    rays = CAMERA.rays()
+    c, s = np.cos(CAMERA_TILT), np.sin(CAMERA_TILT)
+    T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, CAMERA_DISTANCE], [0, 0, 0, 1]])
+    rays = CALIBRATION_CAMERA.rays()
     bare = T_camera_table[:3, 2] @ T_camera_table[:3, 3] / (rays @ T_camera_table[:3, 2])
     limits = DepthRange(settings.near, settings.far)
     blank = ScoredImage(
@@ -91,8 +92,8 @@ def small_problem(settings: ParserSettings = SETTINGS) -> CalibrationProblem:
         pixel_class=jnp.full(bare.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
-        focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
-        centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
+        focal=jnp.array([CALIBRATION_CAMERA.fx, CALIBRATION_CAMERA.fy], jnp.float32),
+        centre=jnp.array([CALIBRATION_CAMERA.cx, CALIBRATION_CAMERA.cy], jnp.float32),
         bare_depth=jnp.asarray(bare, jnp.float32),
         outlier_scale=jnp.float32(limits.outlier_scale),
         front_margin=jnp.float32(3 * settings.sigma_max),
@@ -135,12 +136,12 @@ def observe(
     pixel returned, or as many free points; of those the depth image holds one a pixel, for the search to look at."""
     rays = np.asarray(problem.blank.ray_x), np.asarray(problem.blank.ray_y)
     if problem.settings.likelihood == "points":
-        points = draw_points(rng, surface, *rays, noise, problem.limits)
+        points = sample_points(rng, surface, *rays, noise, problem.limits)
         some = points.pixel_class[0] != NO_RETURN
         return problem.blank._replace(
             depth=jnp.where(some, points.depth[0], 0.0), pixel_class=points.pixel_class[0], points=points
         )
-    depth = draw_depth(rng, surface, *rays, noise, problem.limits, problem.settings.window)
+    depth = sample_depth(rng, surface, *rays, noise, problem.limits, problem.settings.window)
     return problem.blank._replace(depth=jnp.asarray(depth, jnp.float32))
 
 

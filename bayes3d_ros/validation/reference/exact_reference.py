@@ -78,7 +78,7 @@ class Reference(NamedTuple):
 
 
 def empty_table(problem: SmallProblem) -> GivenScene:
-    return _scene(problem, problem.context.image.bare_depth)
+    return _given_scene(problem, problem.context.image.bare_depth)
 
 
 def with_object(problem: SmallProblem, placement: Placement) -> GivenScene:
@@ -87,10 +87,10 @@ def with_object(problem: SmallProblem, placement: Placement) -> GivenScene:
     one = jax.tree.map(lambda a: a[0], single(placement))
     rays = jnp.meshgrid(image.ray_x, image.ray_y)
     depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
-    return _scene(problem, jnp.minimum(image.bare_depth, depth))
+    return _given_scene(problem, jnp.minimum(image.bare_depth, depth))
 
 
-def _scene(problem: SmallProblem, depth: Float[Array, "H W"]) -> GivenScene:
+def _given_scene(problem: SmallProblem, depth: Float[Array, "H W"]) -> GivenScene:
     padded = pad_scene(depth, problem.window)[None]
     loglik_grid = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
     loglik_grid = loglik_grid - loglik_grid.max()

@@ -33,7 +33,7 @@ class DepthRange(NamedTuple):
         return 3 / (self.far**3 - self.near**3)
 
 
-def draw_scene(
+def sample_scene(
     key: PRNGKeyArray, log_count: Float[np.ndarray, "M+1"], library: LibraryArrays, table: Table
 ) -> tuple[Placement, int]:
     """A scene from the joint prior `P(n) prod p(object) 1[disjoint]`, normalised once over everything: n and the
@@ -74,14 +74,14 @@ def _proposals(
     return objects, count, disjoint
 
 
-def draw_noise(rng: np.random.Generator, grid: NoiseGrid) -> tuple[float, float]:
+def sample_noise(rng: np.random.Generator, grid: NoiseGrid) -> tuple[float, float]:
     """(sigma, p_outlier) from the prior that is integrated: U(0, sigma_max) and U(0, 1) without the tenths of each that
     lie beyond the grid's ends."""
     sigma, p_outlier = grid.coarse
     return float(rng.uniform(sigma[0], sigma[-1])), float(rng.uniform(p_outlier[0], p_outlier[-1]))
 
 
-def draw_depth(
+def sample_depth(
     rng: np.random.Generator,
     surface: Float[np.ndarray, "H W"],
     ray_x: Float[np.ndarray, "W"],
@@ -107,7 +107,7 @@ def draw_depth(
     high = np.where(empty, limits.far, np.where(finite, near_by, -np.inf).max(-1))
     # Planes through neighbours may reach past them by as much as these differ.
     reach = high - low + _TAIL * sigma
-    seen = _draw_inliers(
+    seen = _sample_inliers(
         *(jnp.asarray(a, jnp.float32) for a in (padded, low - reach, high + reach, ray_x, ray_y, sigma)),
         jnp.asarray(rng.random(surface.shape), jnp.float32),
         window,
@@ -117,7 +117,7 @@ def draw_depth(
     return np.where(empty | (rng.random(surface.shape) < p_outlier), anywhere, np.asarray(seen, np.float64))
 
 
-def draw_points(
+def sample_points(
     rng: np.random.Generator,
     surface: Float[np.ndarray, "H W"],
     ray_x: Float[np.ndarray, "W"],
@@ -160,7 +160,7 @@ def draw_points(
 
 
 @partial(jax.jit, static_argnames="window")
-def _draw_inliers(
+def _sample_inliers(
     padded: Float[Array, "Hp Wp"],
     low: Float[Array, "H W"],
     high: Float[Array, "H W"],

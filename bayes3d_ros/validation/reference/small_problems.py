@@ -20,14 +20,15 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.context import Context
 
-CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
-NEAR, FAR = 0.1, 2.0  # metres
-DISTANCE, ELEVATION = 0.45, np.radians(38.0)  # of the camera from the table's origin, above its plane
+SMALL_CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
+NEAREST_RETURN, FARTHEST_RETURN = 0.1, 2.0  # metres
+SMALL_CAMERA_DISTANCE = 0.45  # of the camera from the table's origin, metres
+SMALL_CAMERA_ELEVATION = np.radians(38.0)  # above the table's plane
 TABLE_SIZE = (0.22, 0.22)
 SIGMA_MAX = 0.03
-P_OUTLIER = 0.2
-WINDOW, MAX_OBJECTS = 3, 2
-VOXEL = 0.005
+TRUE_P_OUTLIER = 0.2
+SMALL_WINDOW, MAX_OBJECTS = 3, 2
+SMALL_VOXEL = 0.005
 
 _march = jax.jit(march)
 
@@ -41,7 +42,7 @@ class SmallProblem(NamedTuple):
     grid: NoiseGrid
     truth: Placement  # [k]
     table_size: tuple[float, float] = TABLE_SIZE
-    window: int = WINDOW
+    window: int = SMALL_WINDOW
     max_objects: int = MAX_OBJECTS
 
 
@@ -73,10 +74,10 @@ def cup(handle: bool) -> trimesh.Trimesh:
 
 def camera_pose() -> Float[np.ndarray, "4 4"]:
     """T_camera_table of a camera that looks along +y of the table, down at its origin."""
-    c, s = np.cos(ELEVATION), np.sin(ELEVATION)
+    c, s = np.cos(SMALL_CAMERA_ELEVATION), np.sin(SMALL_CAMERA_ELEVATION)
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, -s, -c], [0, c, -s]]
-    pose[2, 3] = DISTANCE
+    pose[2, 3] = SMALL_CAMERA_DISTANCE
     return pose
 
 
@@ -88,34 +89,34 @@ def make(
 ) -> SmallProblem:
     """An image of upright objects, rows (type, x, y, yaw): `yaw` turns their mesh. Noise is normal along the rays, its
     outliers are uniform in the frustum's volume."""
-    library = Library(tuple(model_from_mesh(mesh, key, VOXEL) for key, mesh in meshes.items()))
+    library = Library(tuple(model_from_mesh(mesh, key, SMALL_VOXEL) for key, mesh in meshes.items()))
     arrays = library_arrays(library)
     table = Table(jnp.asarray(camera_pose(), jnp.float32), jnp.array(TABLE_SIZE))
     truth = upright(library, arrays.T_contact_object, rows)
-    bare = _bare_table(CAMERA)
+    bare = _bare_table(SMALL_CAMERA)
     depth = bare.copy()
-    rays = CAMERA.rays()
+    rays = SMALL_CAMERA.rays()
     for k in range(len(rows)):
         one = jax.tree.map(lambda a, k=k: a[k], truth)
         pose = T_camera_object(one, arrays, table)
         depth = np.minimum(depth, np.asarray(_march(arrays, one.type, pose, (rays[..., 0], rays[..., 1]))))
     rng = np.random.default_rng(0)
     noisy = depth + sigma / np.linalg.norm(rays, axis=-1) * rng.normal(size=depth.shape)
-    wild = np.cbrt(NEAR**3 + rng.random(depth.shape) * (FAR**3 - NEAR**3))
-    observed = np.where(rng.random(depth.shape) < P_OUTLIER, wild, noisy)
+    wild = np.cbrt(NEAREST_RETURN**3 + rng.random(depth.shape) * (FARTHEST_RETURN**3 - NEAREST_RETURN**3))
+    observed = np.where(rng.random(depth.shape) < TRUE_P_OUTLIER, wild, noisy)
     image = ScoredImage(
         depth=jnp.asarray(observed, jnp.float32),
         pixel_class=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
-        focal=jnp.array([CAMERA.fx, CAMERA.fy], jnp.float32),
-        centre=jnp.array([CAMERA.cx, CAMERA.cy], jnp.float32),
+        focal=jnp.array([SMALL_CAMERA.fx, SMALL_CAMERA.fy], jnp.float32),
+        centre=jnp.array([SMALL_CAMERA.cx, SMALL_CAMERA.cy], jnp.float32),
         bare_depth=jnp.asarray(bare, jnp.float32),
-        outlier_scale=jnp.float32(3 / (FAR**3 - NEAR**3)),
+        outlier_scale=jnp.float32(3 / (FARTHEST_RETURN**3 - NEAREST_RETURN**3)),
         front_margin=jnp.float32(3 * SIGMA_MAX),
     )
     context = Context(image, arrays, table)
-    return SmallProblem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, WINDOW), truth)
+    return SmallProblem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, SMALL_WINDOW), truth)
 
 
 def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Placement:
@@ -133,7 +134,7 @@ def _bare_table(camera: Intrinsics) -> Float[np.ndarray, "H W"]:
     facing = rays @ T[:3, 2]
     with np.errstate(divide="ignore"):
         depth = T[:3, 2] @ T[:3, 3] / facing
-    return np.where((facing < -0.01) & (depth < FAR), depth, np.inf)
+    return np.where((facing < -0.01) & (depth < FARTHEST_RETURN), depth, np.inf)
 
 
 # Handles point away from the camera at a quarter turn.

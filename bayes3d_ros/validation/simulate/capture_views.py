@@ -12,11 +12,12 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.learning.learn import Learned
 from bayes3d_ros.validation.simulate.pose_noise import disturbed
-from bayes3d_ros.validation.simulate.random_scenes import CAMERA, RestingObject, perfect_depth
-from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, RestingObject, perfect_depth
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
 
-DISTANCE, PITCHES = 0.6, (40.0, 30.0, 45.0)  # metres from the object's middle; degrees downwards, in turn
-SURFACE_POINTS = 40_000
+CAPTURE_DISTANCE = 0.6  # metres from the object's middle
+CAPTURE_PITCHES = (40.0, 30.0, 45.0)  # degrees downwards, in turn
+ALIGNED_POINTS = 40_000
 _ALIGN_ROUNDS, _TRIMMED = 30, 0.9
 
 
@@ -38,19 +39,19 @@ def capture(
     """Evenly spread views, with sensor noise; poses are off by pose_noise (metres, radians)."""
     noise = SensorNoise()
     bias_rng, pixel_rng, pose_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
-    bias = draw_bias_field(noise, bias_rng)
+    bias = sample_bias_field(noise, bias_rng)
     points = thing.mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
     middle = (points.min(0) + points.max(0)) / 2
     frames, seen = [], []
     for k in range(views):
-        azimuth, pitch = 2 * np.pi * k / views + 0.2, np.radians(PITCHES[k % len(PITCHES)])
-        T_table_camera = look_at(middle + DISTANCE * direction(azimuth - np.pi / 2, pitch), middle)
+        azimuth, pitch = 2 * np.pi * k / views + 0.2, np.radians(CAPTURE_PITCHES[k % len(CAPTURE_PITCHES)])
+        T_table_camera = look_at(middle + CAPTURE_DISTANCE * direction(azimuth - np.pi / 2, pitch), middle)
         clean = perfect_depth(thing, T_table_object, T_table_camera)
-        depth = add_sensor_noise(clean.depth, clean.cosine, CAMERA, noise, bias, pixel_rng)
+        depth = add_sensor_noise(clean.depth, clean.cosine, REALSENSE, noise, bias, pixel_rng)
         returned = (clean.solid == 0) & (depth > 0)
-        seen.append(unproject(clean.depth, CAMERA)[returned] @ T_table_camera[:3, :3].T + T_table_camera[:3, 3])
+        seen.append(unproject(clean.depth, REALSENSE)[returned] @ T_table_camera[:3, :3].T + T_table_camera[:3, 3])
         told = disturbed(T_table_camera, *pose_noise, pose_rng)
-        frames.append(DepthFrame(depth.astype(np.float32), CAMERA, (k + 1) * 10**9, "camera", told))
+        frames.append(DepthFrame(depth.astype(np.float32), REALSENSE, (k + 1) * 10**9, "camera", told))
     return Captures(frames, np.concatenate(seen), T_table_object)
 
 
@@ -65,7 +66,7 @@ class ShapeErrors(NamedTuple):
 def shape_errors(learned: Learned, captures: Captures, mesh: trimesh.Trimesh, aligned: bool) -> ShapeErrors:
     """Distances of the model's seen surface from the true one, where it was captured. `aligned`: moved rigidly onto it
     first, as poses that are wrong on average leave the model where it is not, but of the right shape."""
-    surface = np.asarray(trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0])
+    surface = np.asarray(trimesh.sample.sample_surface(mesh, ALIGNED_POINTS, seed=0)[0])
     T = captures.T_table_object
     surface = surface @ T[:3, :3].T + T[:3, 3]
     model = learned.model

@@ -9,7 +9,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.validation.simulate.ray_casting import Rendering
 from bayes3d_ros.validation.simulate.sensor_noise import BiasField, SensorNoise
 
-_COSINES, _WAVES = 3, 24
+_IMAGE_COSINES, _WAVES = 3, 24
 
 
 class CorrelatedErrors(NamedTuple):
@@ -38,9 +38,9 @@ class CorrelatedErrors(NamedTuple):
         return np.where(np.isfinite(rendering.depth), error, 0.0)
 
 
-def draw_correlated_errors(noise: SensorNoise, objects: int, rng: np.random.Generator) -> CorrelatedErrors:
+def sample_correlated_errors(noise: SensorNoise, objects: int, rng: np.random.Generator) -> CorrelatedErrors:
     """Errors of one recording of so many objects, with the sizes that `noise` names."""
-    image = rng.normal(size=(_COSINES, _COSINES))
+    image = rng.normal(size=(_IMAGE_COSINES, _IMAGE_COSINES))
     image /= np.abs(_cosines(65) @ image @ _cosines(65).T).max()
     offsets = rng.uniform(-1, 1, objects)
     waves = rng.normal(size=(_WAVES, 3)) / max(noise.waviness_length, 1e-6)
@@ -55,4 +55,4 @@ def draw_correlated_errors(noise: SensorNoise, objects: int, rng: np.random.Gene
 
 def _cosines(count: int) -> Float[np.ndarray, "count 3"]:
     """Half cosines over `count` pixels: a constant, half a wave, a whole wave."""
-    return np.cos(np.pi * (np.arange(count)[:, None] + 0.5) / count * np.arange(_COSINES))
+    return np.cos(np.pi * (np.arange(count)[:, None] + 0.5) / count * np.arange(_IMAGE_COSINES))

@@ -15,13 +15,13 @@ from bayes3d_ros.geometry.poses import direction, look_at
 from bayes3d_ros.likelihood import reference
 from bayes3d_ros.objects.model import ObjectModel
 from bayes3d_ros.validation.simulate.ray_casting import RayCaster
-from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
 
 FIELD_OF_VIEW = np.radians(45.0)
 SENSOR = 400  # pixels across, of the camera that sees meshes
 WALL = 3.0  # metres: what is seen beside the object
-RATE = 30.0  # frames a second
-DISTANCE, PITCH, SWEEP = 0.42, np.radians(33.0), np.radians(110.0)  # metres, downwards, around in all
+FRAME_RATE = 30.0  # frames a second
+PAN_DISTANCE, PAN_PITCH, PAN_SWEEP = 0.42, np.radians(33.0), np.radians(110.0)  # metres, downwards, around in all
 SWAY = (0.03, np.radians(6.0))  # metres nearer and farther, and up and down, slowly
 JITTER = (0.001, np.radians(0.2))  # metres and radians, a standard deviation, from frame to frame
 
@@ -40,9 +40,9 @@ def panning_cameras(model: ObjectModel, frames: int, seed: int) -> list[Float[np
     phase = rng.uniform(0, 2 * np.pi, 2)
     poses = []
     for k in range(frames):
-        turn, wave = start + SWEEP * k / 120, 2 * np.pi * k / 120
-        distance = DISTANCE + SWAY[0] * np.sin(wave + phase[0])
-        pitch = PITCH + SWAY[1] * np.sin(wave + phase[1])
+        turn, wave = start + PAN_SWEEP * k / 120, 2 * np.pi * k / 120
+        distance = PAN_DISTANCE + SWAY[0] * np.sin(wave + phase[0])
+        pitch = PAN_PITCH + SWAY[1] * np.sin(wave + phase[1])
         pose = look_at(middle + distance * direction(turn, pitch), middle)
         pose[:3, 3] += rng.normal(0, JITTER[0], 3)
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, JITTER[1], 3)).as_matrix()
@@ -72,7 +72,7 @@ def independent_frames(
     noise = noise or SensorNoise()
     caster, camera = RayCaster([(load_mesh(mesh_file), np.eye(4))]), pinhole(SENSOR)
     rng = np.random.default_rng(seed)
-    bias = draw_bias_field(noise, rng)
+    bias = sample_bias_field(noise, rng)
     for k, T_object_camera in enumerate(poses):
         clean = caster.render(T_object_camera, camera)
         nothing = np.isnan(clean.depth)
@@ -81,4 +81,4 @@ def independent_frames(
 
 
 def _frame(depth: np.ndarray, camera: Intrinsics, k: int) -> DepthFrame:
-    return DepthFrame(depth.astype(np.float32), camera, 1_700_000_000 * 10**9 + round(k * 1e9 / RATE), "camera")
+    return DepthFrame(depth.astype(np.float32), camera, 1_700_000_000 * 10**9 + round(k * 1e9 / FRAME_RATE), "camera")

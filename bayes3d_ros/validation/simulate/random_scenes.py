@@ -10,15 +10,16 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.geometry.camera import Intrinsics, project
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.poses import direction, look_at
-from bayes3d_ros.validation.simulate.correlated_errors import draw_correlated_errors
+from bayes3d_ros.validation.simulate.correlated_errors import sample_correlated_errors
 from bayes3d_ros.validation.simulate.ray_casting import RayCaster, Rendering, SimulationError
 from bayes3d_ros.validation.simulate.resting import placed, resting_normals, turn
-from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
 
-CAMERA = Intrinsics(615.0, 615.0, 319.5, 239.5, 640, 480)  # a D435
-TABLE_SIZE, TABLE_HEIGHT = 1.2, 0.75  # metres; the table's sides are not drawn
-PLACES = 0.3  # objects stand up to this far from the middle of the table, along x and y
-DISTANCES, PITCHES = (0.5, 0.9), (30.0, 60.0)  # of the camera: metres from what it looks at, degrees downwards
+REALSENSE = Intrinsics(615.0, 615.0, 319.5, 239.5, 640, 480)  # a D435
+TABLE_SIDE, TABLE_HEIGHT = 1.2, 0.75  # metres; the table's sides are not drawn
+FARTHEST_FROM_MIDDLE = 0.3  # objects stand up to this far from the middle of the table, along x and y
+VIEW_DISTANCES = (0.5, 0.9)  # of the camera, metres from what it looks at
+VIEW_PITCHES = (30.0, 60.0)  # of the camera, degrees downwards
 AIM = 0.06  # metres by which it looks past the object, a standard deviation; the object is in view all the same
 IMAGE_BIAS, OBJECT_BIAS = (0.0, 0.002), 0.002  # metres; see SensorNoise
 WAVINESS, WAVINESS_LENGTH = (0.001, 0.002), (0.03, 0.1)  # metres, a standard deviation and a length
@@ -78,9 +79,9 @@ def random_scene(thing: RestingObject, seed: int, noise: SensorNoise | None = No
     T_table_camera = _view(thing.mesh, T_table_object, view)
     noise = noise or random_noise(errors)
     clean = perfect_depth(thing, T_table_object, T_table_camera)
-    depth = clean.depth + draw_correlated_errors(noise, 1, errors).at(clean, T_table_camera, CAMERA)
-    depth = add_sensor_noise(depth, clean.cosine, CAMERA, noise, draw_bias_field(noise, errors), pixels)
-    frame = DepthFrame(depth, CAMERA, (1_700_000_000 + seed) * 10**9, "camera", T_table_camera)
+    depth = clean.depth + sample_correlated_errors(noise, 1, errors).at(clean, T_table_camera, REALSENSE)
+    depth = add_sensor_noise(depth, clean.cosine, REALSENSE, noise, sample_bias_field(noise, errors), pixels)
+    frame = DepthFrame(depth, REALSENSE, (1_700_000_000 + seed) * 10**9, "camera", T_table_camera)
     return RandomScene(thing.name, rest, frame, T_table_object, noise)
 
 
@@ -101,7 +102,7 @@ def _put(thing: RestingObject, rest: int, rng: np.random.Generator) -> Float[np.
     """T_table_object: at rest, its middle at a random place, turned by a random yaw."""
     yaw = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
     rotation = yaw @ turn(thing.downs[rest], np.array([0.0, 0.0, -1.0]))
-    return placed(thing.mesh, rotation, rng.uniform(-PLACES, PLACES, 2))
+    return placed(thing.mesh, rotation, rng.uniform(-FARTHEST_FROM_MIDDLE, FARTHEST_FROM_MIDDLE, 2))
 
 
 def _view(
@@ -111,12 +112,12 @@ def _view(
     points = mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
     middle = (points.min(0) + points.max(0)) / 2
     for _ in range(_MOST_VIEWS):
-        distance, pitch = rng.uniform(*DISTANCES), np.radians(rng.uniform(*PITCHES))
+        distance, pitch = rng.uniform(*VIEW_DISTANCES), np.radians(rng.uniform(*VIEW_PITCHES))
         azimuth = rng.uniform(0, 2 * np.pi)
         target = middle + np.append(rng.normal(0, AIM, 2), 0)
         T_table_camera = look_at(target + distance * direction(azimuth, pitch), target)
         low, high = _extent(points, T_table_camera)
-        if (low > _BORDER).all() and (high < np.array([CAMERA.width, CAMERA.height]) - _BORDER).all():
+        if (low > _BORDER).all() and (high < np.array([REALSENSE.width, REALSENSE.height]) - _BORDER).all():
             return T_table_camera
     raise SimulationError(f"expected a view of the whole object, found none; it measures {np.ptp(points, axis=0)} m")
 
@@ -125,21 +126,21 @@ def _extent(
     points: Float[np.ndarray, "N 3"], T_table_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Smallest and largest pixel coordinates of points on the table."""
-    pixels, z = project((points - T_table_camera[:3, 3]) @ T_table_camera[:3, :3], CAMERA)
+    pixels, z = project((points - T_table_camera[:3, 3]) @ T_table_camera[:3, :3], REALSENSE)
     return (pixels.min(0), pixels.max(0)) if (z > 0).all() else (np.full(2, -np.inf), np.full(2, np.inf))
 
 
 def perfect_depth(
     thing: RestingObject, T_table_object: Float[np.ndarray, "4 4"], T_table_camera: Float[np.ndarray, "4 4"]
 ) -> Rendering:
-    """What CAMERA sees without errors: rays cast at the object (solid 0) where it is in view, and in closed form the
+    """What is seen without errors: rays cast at the object (solid 0) where it is in view, and in closed form the
     table (solid 1) and the floor (solid 2)."""
-    rays = CAMERA.rays().astype(np.float64)
+    rays = REALSENSE.rays().astype(np.float64)
     down = -(rays @ T_table_camera[2, :3])
     depth = np.where(down > 1e-6, T_table_camera[2, 3] / np.maximum(down, 1e-6), np.nan)
     across = depth[..., None] * (rays @ T_table_camera[:2, :3].T) + T_table_camera[:2, 3]
     with np.errstate(invalid="ignore"):
-        beside = (np.abs(across) > TABLE_SIZE / 2).any(-1)
+        beside = (np.abs(across) > TABLE_SIDE / 2).any(-1)
     depth = np.where(beside, depth * (1 + TABLE_HEIGHT / T_table_camera[2, 3]), depth)
     cosine = np.where(down > 1e-6, down, np.nan) / np.linalg.norm(rays, axis=-1)
     solid = np.where(np.isnan(depth), -1, np.where(beside, 2, 1))
@@ -147,7 +148,7 @@ def perfect_depth(
     points = thing.mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
     low, high = _extent(points, T_table_camera)
     (u, v), (right, bottom) = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
-    crop = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx - u, CAMERA.cy - v, int(right - u), int(bottom - v))
+    crop = Intrinsics(REALSENSE.fx, REALSENSE.fy, REALSENSE.cx - u, REALSENSE.cy - v, int(right - u), int(bottom - v))
     part = thing.caster.render(np.linalg.inv(T_table_object) @ T_table_camera, crop)
     box = np.s_[v:bottom, u:right]
     hit = part.solid == 0

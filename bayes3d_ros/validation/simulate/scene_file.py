@@ -50,7 +50,7 @@ def load_scene(path: Path) -> SimulatedScene:
     """Read a scene. Raises SimulationError, one line naming the file, the key and what was expected."""
     content = read_yaml(path, "scene file", SimulationError)
     try:
-        return _scene(path, content)
+        return _scene_of(path, content)
     except ValueError as error:
         raise SimulationError(f"{path}: {error}") from None
 
@@ -77,33 +77,33 @@ def find_mesh(source: str, folder: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _scene(path: Path, content: Any) -> SimulatedScene:
+def _scene_of(path: Path, content: Any) -> SimulatedScene:
     keys = ("seed", "rate", "start", "camera", "table", "objects", "noise")
     top = _mapping(content, "the scene", keys)
     camera = _mapping(top.get("camera", {}), "camera", ("intrinsics", "eye", "target", "frames", "step", "pose_noise"))
     pinhole = _INTRINSICS | _mapping(camera.get("intrinsics"), "camera.intrinsics", tuple(_INTRINSICS))
-    fx, fy, cx, cy = (_number(pinhole[key], f"camera.intrinsics.{key}") for key in ("fx", "fy", "cx", "cy"))
+    fx, fy, cx, cy = (_finite_number(pinhole[key], f"camera.intrinsics.{key}") for key in ("fx", "fy", "cx", "cy"))
     columns, rows = (_whole(pinhole[key], f"camera.intrinsics.{key}", 1) for key in ("width", "height"))
     table = _mapping(top.get("table", {}), "table", ("size", "height"))
     noise = _mapping(top.get("noise", {}), "noise", tuple(f.name for f in fields(SensorNoise)))
     objects = [] if top.get("objects") is None else top["objects"]
     if not isinstance(objects, list):
         raise ValueError(f"objects: expected a list, got {objects!r}")
-    rate = _number(top.get("rate", 10), "rate")
+    rate = _finite_number(top.get("rate", 10), "rate")
     if rate <= 0:
         raise ValueError(f"rate: expected frames a second > 0, got {rate}")
     off = _vector(camera.get("pose_noise", [0, 0]), "camera.pose_noise", 2)
     if not (off >= 0).all():
         raise ValueError(f"camera.pose_noise: expected metres and degrees >= 0, got {off.tolist()}")
     size = _vector(table.get("size", [1.2, 0.8]), "table.size", 2)
-    height = _number(table.get("height", 0.75), "table.height")
+    height = _finite_number(table.get("height", 0.75), "table.height")
     if not (size > 0).all() or height <= 0:
         raise ValueError(f"table: expected a size and a height > 0, got size {size.tolist()}, height {height}")
     try:
         intrinsics = Intrinsics(fx, fy, cx, cy, columns, rows)
     except ValueError as error:
         raise ValueError(f"camera.intrinsics: {error}") from None
-    cameras, start = _cameras(camera), round(_number(top.get("start", 1_700_000_000), "start"))
+    cameras, start = _cameras(camera), round(_finite_number(top.get("start", 1_700_000_000), "start"))
     if start < 0 or start + len(cameras) / rate >= 2**31:
         raise ValueError(f"start, rate: expected stamps from 0 to 2^31 seconds, got {start} s and {rate} Hz")
     return SimulatedScene(
@@ -117,7 +117,7 @@ def _scene(path: Path, content: Any) -> SimulatedScene:
         table_size=(size[0], size[1]),
         table_height=height,
         objects=tuple(_object(entry, f"objects[{i}]", path.parent) for i, entry in enumerate(objects)),
-        noise=SensorNoise(**{key: _number(value, f"noise.{key}") for key, value in noise.items()}),
+        noise=SensorNoise(**{key: _finite_number(value, f"noise.{key}") for key, value in noise.items()}),
     )
 
 
@@ -155,8 +155,8 @@ def _object(entry: Any, where: str, folder: Path) -> SceneObject:
             rotation = Rotation.from_euler("xy", _vector(rest, "rest", 2), degrees=True).as_matrix()
     except ValueError as error:
         raise ValueError(f"{where}.{error}") from None
-    yaw = _number(given.get("yaw", 0), f"{where}.yaw")
-    middle = np.array([_number(given.get(axis, 0), f"{where}.{axis}") for axis in ("x", "y")])
+    yaw = _finite_number(given.get("yaw", 0), f"{where}.yaw")
+    middle = np.array([_finite_number(given.get(axis, 0), f"{where}.{axis}") for axis in ("x", "y")])
     pose = placed(mesh, Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation, middle)
     name = given.get("name", Path(source).stem)
     if not isinstance(name, str) or not name:
@@ -174,7 +174,7 @@ def _mapping(value: Any, where: str, keys: tuple[str, ...]) -> dict[str, Any]:
     return value
 
 
-def _number(value: Any, where: str) -> float:
+def _finite_number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise ValueError(f"{where}: expected a number, got {value!r}")
     return value
@@ -189,4 +189,4 @@ def _whole(value: Any, where: str, low: int) -> int:
 def _vector(value: Any, where: str, length: int) -> np.ndarray:
     if not isinstance(value, list) or len(value) != length:
         raise ValueError(f"{where}: expected {length} numbers, got {value!r}")
-    return np.array([_number(v, where) for v in value], float)
+    return np.array([_finite_number(v, where) for v in value], float)

@@ -87,7 +87,7 @@ class BiasField(NamedTuple):
         return np.cos(angles).sum(-1) * np.sqrt(2 / len(self.phases))
 
 
-def draw_bias_field(noise: SensorNoise, rng: np.random.Generator, waves: int = 48) -> BiasField:
+def sample_bias_field(noise: SensorNoise, rng: np.random.Generator, waves: int = 48) -> BiasField:
     """The bias of one camera, drawn once a recording: its covariance is exp(-distance^2 / (2 bias_length^2))."""
     length = max(noise.bias_length, 1e-6)
     return BiasField(rng.normal(size=(waves, 3)) / length, rng.uniform(0, 2 * np.pi, waves))

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from bayes3d_ros.files.atomic import write_json
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import BagWriter
-from bayes3d_ros.validation.simulate.correlated_errors import draw_correlated_errors
+from bayes3d_ros.validation.simulate.correlated_errors import sample_correlated_errors
 from bayes3d_ros.validation.simulate.pose_noise import disturbed
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster, Rendering
 from bayes3d_ros.validation.simulate.scene_file import SimulatedScene, load_scene
-from bayes3d_ros.validation.simulate.sensor_noise import add_sensor_noise, draw_bias_field
+from bayes3d_ros.validation.simulate.sensor_noise import add_sensor_noise, sample_bias_field
 
 FRAME_ID = "camera_depth_optical_frame"
 _TABLE_THICKNESS, _FLOOR_SIZE = 0.03, 20.0
@@ -53,8 +53,8 @@ def simulate(scene_yaml: Path, out: Path, progress: Callable[[int, int], Any] | 
     caster = scene_caster(scene)
     seeds = np.random.SeedSequence(scene.seed).spawn(3 + len(scene.cameras))
     camera_seed, *frame_seeds, surface_seed, pose_seed = seeds
-    bias = draw_bias_field(scene.noise, np.random.default_rng(camera_seed))
-    errors = draw_correlated_errors(scene.noise, len(scene.objects), np.random.default_rng(surface_seed))
+    bias = sample_bias_field(scene.noise, np.random.default_rng(camera_seed))
+    errors = sample_correlated_errors(scene.noise, len(scene.objects), np.random.default_rng(surface_seed))
     pose_rng = np.random.default_rng(pose_seed)
     truth = []
     with BagWriter(out) as bag:
