@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from bayes3d_ros.ros.conversions import matrix_from_values, pose_to_matrix, stamp_to_ns
+from bayes3d_ros.ros.names import POSE_INPUT
 from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
@@ -69,7 +70,7 @@ class CameraPoseSource:
         self._topic = AutoSubscription(
             node,
             PoseStamped,
-            "camera_pose",
+            POSE_INPUT,
             self._on_pose,
             reliability=settings.qos_reliability,
             depth=100,

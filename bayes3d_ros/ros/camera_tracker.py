@@ -13,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
@@ -22,7 +21,7 @@ from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
-from bayes3d_ros.ros.conversions import camera_particles, camera_pose, frame_from_messages, path_pose
+from bayes3d_ros.ros.conversions import camera_particles, camera_pose_message, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
@@ -31,14 +30,14 @@ from bayes3d_ros.ros.parameters import (
     DEPTH_INPUT_PARAMETERS,
     CameraTrackerNodeSettings,
 )
-from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.qos import RELIABLE
+from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.session import CameraFollower
 from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
 from bayes3d_ros.tracking.world_file import load_world
 
-_RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 _TRACKER_PARAMETERS = {"library", "world", *(f.name for f in fields(TrackerSettings))}
 
 _PURPOSE = "Depth images in, where the camera is in the world that it first saw out."
@@ -83,9 +82,9 @@ class CameraTrackerNode(Node):
         self._known: Tracking | None = None  # the worker's own
         self._told = ""
         self._path: deque[PoseStamped] = deque(maxlen=self._node_settings().path_length)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", _RELIABLE)
-        self._particles = self.create_publisher(PoseArray, "~/particles", _RELIABLE)
-        self._trail = self.create_publisher(PathMessage, "~/path", _RELIABLE)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", RELIABLE)
+        self._particles = self.create_publisher(PoseArray, "~/particles", RELIABLE)
+        self._trail = self.create_publisher(PathMessage, "~/path", RELIABLE)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._listen()
         self._begin()
@@ -155,7 +154,7 @@ class CameraTrackerNode(Node):
             return
         settings = self._node_settings()
         world = settings.table_frame
-        self._pose.publish(camera_pose(estimate, world))
+        self._pose.publish(camera_pose_message(estimate, world))
         self._particles.publish(camera_particles(estimate, world, settings.most_particles))
         self._path.append(path_pose(estimate, world))
         if self._trail.get_subscription_count():  # grows with every frame
@@ -204,7 +203,7 @@ def main(args: list[str] | None = None) -> int:
     check_arguments("camera_tracker", _PURPOSE, args)
     prepare_jax()
     every_core()
-    return run(CameraTrackerNode, args)
+    return run_node(CameraTrackerNode, args)
 
 
 if __name__ == "__main__":

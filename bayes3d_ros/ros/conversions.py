@@ -97,7 +97,7 @@ def pose_array(posterior: ScenePosterior) -> PoseArray:
     return PoseArray(header=header(posterior), poses=poses)
 
 
-def camera_pose(estimate: CameraEstimate, world_frame: str) -> PoseWithCovarianceStamped:
+def camera_pose_message(estimate: CameraEstimate, world_frame: str) -> PoseWithCovarianceStamped:
     """The camera's pose in the world, at the image's stamp; covariance of x y z and turns about the world's axes."""
     message = PoseWithCovarianceStamped(header=Header(stamp=ns_to_stamp(estimate.stamp_ns), frame_id=world_frame))
     message.pose.pose = matrix_to_pose(estimate.T_world_camera)

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
@@ -29,9 +28,11 @@ from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.conversions import matrix_from_values
 from bayes3d_ros.ros.detections import detections_type
-from bayes3d_ros.ros.processes import NodeProcess, free_domain
+from bayes3d_ros.ros.processes import START_SECONDS, NodeProcess, free_domain
+from bayes3d_ros.ros.qos import LATCHED
 from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
 from bayes3d_ros.ros.spinning import shut_down
+from bayes3d_ros.ros.summary import spaced
 from bayes3d_ros.validation.statistics.metrics import add_s
 
 MESHES = (
@@ -46,7 +47,7 @@ OUTPUTS: dict[str, type] = {
     "posterior": PointCloud2,
     "summary": DiagnosticArray,
 }
-START_SECONDS, PARSE_SECONDS = 600.0, 120.0
+PARSE_SECONDS = 120.0
 
 
 class DemoError(Exception):
@@ -64,8 +65,7 @@ class Outputs:
         self.kinds = OUTPUTS | ({} if detections is None else {"detections": detections})
         for name, kind in self.kinds.items():
             node.create_subscription(kind, f"/scene_parser/{name}", self._keeper(name), 10)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(String, "/scene_parser/library", self._keep_library, latched)
+        node.create_subscription(String, "/scene_parser/library", self._keep_library, LATCHED)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnosis, 10)
 
     def missing(self, stamp_ns: int) -> list[str]:
@@ -200,14 +200,10 @@ def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> l
         error = f"{add_s_by_type[estimate.type] * 1e3:.1f}" if estimate.type in add_s_by_type else "not there"
         lines.append(
             f"{estimate.type:<22}{probability:>8.3f}{estimate.probability:>10.3f}  "
-            f"{_row(estimate.position, 3, 23)}{_row(estimate.orientation, 3, 28)}"
-            f"{_row(sigma[:3] * 1e3, 2, 17)}{_row(np.degrees(sigma[3:]), 2, 17)}{error:>10}  "
+            f"{spaced(estimate.position, 3):<23}{spaced(estimate.orientation, 3):<28}"
+            f"{spaced(sigma[:3] * 1e3, 2):<17}{spaced(np.degrees(sigma[3:]), 2):<17}{error:>10}  "
             + " ".join(f"{mode.weight:.2f}" for mode in estimate.modes[:4])
         )
     counts = ", ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items() if p > 5e-4)
     lines.append(f"p(number of objects) {counts}; parsed in {posterior.seconds * 1e3:.0f} ms")
     return lines
-
-
-def _row(values: np.ndarray, digits: int, width: int) -> str:
-    return " ".join(f"{v:.{digits}f}" for v in values).ljust(width)

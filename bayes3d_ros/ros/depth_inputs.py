@@ -12,10 +12,10 @@ from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose, CameraPoseSo
 from bayes3d_ros.ros.conversions import stamp_to_ns
 from bayes3d_ros.ros.diagnostics import InputView, TopicView
 from bayes3d_ros.ros.input_queue import InputQueue
+from bayes3d_ros.ros.names import DEPTH_INPUT, INFO_INPUT
 from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 
-DEPTH_TOPIC, INFO_TOPIC = "depth/image_rect", "depth/camera_info"
 _LOOK = 0.2  # seconds between two looks at who publishes
 _POLL = 0.02  # seconds between two looks at what waits, where something does
 
@@ -61,10 +61,10 @@ class DepthInputs:
         self._polling = node.create_timer(_POLL, self._poll, clock=steady)
         reliability = settings.qos_reliability
         self._image_topic = AutoSubscription(
-            node, Image, DEPTH_TOPIC, self._on_image, reliability=reliability, depth=10
+            node, Image, DEPTH_INPUT, self._on_image, reliability=reliability, depth=10
         )
         self._info_topic = AutoSubscription(
-            node, CameraInfo, INFO_TOPIC, self._on_info, reliability=reliability, depth=10, latched=True
+            node, CameraInfo, INFO_INPUT, self._on_info, reliability=reliability, depth=10, latched=True
         )
 
     @property

@@ -75,7 +75,7 @@ def why_no_input(view: InputView) -> str:
     return ""
 
 
-def warnings(view: InputView) -> list[str]:
+def input_warnings(view: InputView) -> list[str]:
     """What is wrong with the inputs though images are complete."""
     told = []
     if view.pose_problem:
@@ -87,7 +87,7 @@ def warnings(view: InputView) -> list[str]:
     return told
 
 
-def notes(view: InputView) -> list[str]:
+def input_notes(view: InputView) -> list[str]:
     """What a user should know though nothing is wrong."""
     return [] if view.stamps_agree else ["CameraInfo has other stamps than the images; the latest is used"]
 
@@ -223,7 +223,7 @@ class Health:
                 backend=self.backend,
                 ess=self._ess,
                 last_problem=self._problem,
-                notes="" if view is None else "; ".join([*warnings(view), *notes(view), *self._warnings]),
+                notes="" if view is None else "; ".join([*input_warnings(view), *input_notes(view), *self._warnings]),
             )
         return diagnostic_array(status)
 
@@ -243,7 +243,7 @@ def judge(health: Health, view: InputView, *, idle: bool, good: str) -> tuple[by
     silent = health.why_silent(view)
     if silent:
         return WARN, silent
-    told = [*warnings(view), *health.warnings()]
+    told = [*input_warnings(view), *health.warnings()]
     return (WARN, f"{good}; {'; '.join(told)}") if told else (OK, good)
 
 

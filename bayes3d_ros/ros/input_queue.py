@@ -13,7 +13,7 @@ InfoT = TypeVar("InfoT")
 PoseT = TypeVar("PoseT")
 
 JUMP_NS = 1_000_000_000  # a stamp this much older than the newest is of a bag that loops, or a clock that was set back
-MOST_BYTES = 256 << 20  # of images that wait
+MOST_WAITING_BYTES = 256 << 20  # of images that wait
 _MOST_REMEMBERED = 1024  # CameraInfo messages, and arrivals of images
 
 # pose(stamp_ns, image, last): the pose of an image's camera, or None while a better one may come. With `last` there is
@@ -63,7 +63,9 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
     Times are seconds of a steady clock, and are the caller's. No call takes long, and none waits.
     """
 
-    def __init__(self, patience: float, find_pose: FindPose[ImageT, PoseT], most_bytes: int = MOST_BYTES) -> None:
+    def __init__(
+        self, patience: float, find_pose: FindPose[ImageT, PoseT], most_bytes: int = MOST_WAITING_BYTES
+    ) -> None:
         self._patience, self._find_pose, self._most_bytes = patience, find_pose, most_bytes
         self._images: dict[tuple[int, int], _Waiting[ImageT]] = {}
         self._bytes = 0

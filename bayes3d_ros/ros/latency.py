@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.processes import NodeProcess, free_domain
+from bayes3d_ros.ros.processes import START_SECONDS, NodeProcess, free_domain
 from bayes3d_ros.ros.received import stamp_of
 from bayes3d_ros.ros.spinning import shut_down
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, Case, line, parsing_row, ycb_library
@@ -24,8 +24,7 @@ from bayes3d_ros.validation.bench.speed_rows import SpeedRow
 __all__ = ["HEADER", "count", "line", "node_row", "rows"]
 
 HEADER = "a scene_parser process: from the image's arrival to its poses'"
-RATE = 0.03  # of the recorded speed: a frame every three seconds, none waits for another
-START_SECONDS = 600.0
+PLAYED_RATE = 0.03  # of the recorded speed: a frame every three seconds, none waits for another
 
 
 class LatencyError(Exception):
@@ -45,7 +44,7 @@ def rows() -> Iterator[SpeedRow]:
             yield node_row(Case(share_directory() / "bags" / bag, TEN_TYPES), library, Path(folder))
 
 
-def node_row(case: Case, library: Path, logs: Path, rate: float = RATE) -> SpeedRow:
+def node_row(case: Case, library: Path, logs: Path, rate: float = PLAYED_RATE) -> SpeedRow:
     """Seconds of every frame of a bag that bag_player plays slowly. Raises LatencyError where poses do not come."""
     reader = read_frames(case.bag)
     frames = list(reader)

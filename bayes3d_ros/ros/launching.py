@@ -23,13 +23,13 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.names import full_name, played, resolved
+from bayes3d_ros.ros.names import DEPTH_INPUT, INFO_INPUT, POSE_INPUT, full_name, played, resolved
+from bayes3d_ros.ros.processes import START_SECONDS
 from bayes3d_ros.ros.rviz_config import INFO_BESIDE_IMAGE, rviz_config
 from bayes3d_ros.ros.transport import chosen_transport
 
 PACKAGE = "bayes3d_ros"
-INPUTS = {"depth": "depth/image_rect", "camera_info": "depth/camera_info", "camera_pose": "camera_pose"}
-PLAYER_PATIENCE = "600"  # seconds; a node's first start on a machine compiles for minutes
+INPUTS = {"depth": DEPTH_INPUT, "camera_info": INFO_INPUT, "camera_pose": POSE_INPUT}
 
 
 class Argument(NamedTuple):
@@ -127,7 +127,7 @@ def _actions(context: LaunchContext, executable: str, values: dict[str, str], pa
                 executable="bag_player",
                 namespace=values["namespace"],
                 output="screen",
-                arguments=[bag, "--wait", PLAYER_PATIENCE, "--wait-for", full_name(namespace, name), *loop],
+                arguments=[bag, "--wait", f"{START_SECONDS:g}", "--wait-for", full_name(namespace, name), *loop],
                 additional_env=environment,
             )
         )

@@ -43,7 +43,7 @@ class SceneMarkers:
             name.scale.z = _TEXT_HEIGHT
             name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
 
-            orientation, axes = ellipsoid(estimate.covariance[:3, :3])
+            orientation, axes = principal_axes(estimate.covariance[:3, :3])
             spread = Marker(type=Marker.SPHERE, color=label_colour(label, 0.4))
             spread.pose = pose_message(estimate.position, orientation)
             spread.scale = Vector3(**dict(zip("xyz", (2 * 2 * axes).tolist(), strict=True)))
@@ -58,7 +58,7 @@ class SceneMarkers:
         return MarkerArray(markers=markers)
 
 
-def ellipsoid(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
+def principal_axes(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
     """Quaternion x y z w and standard deviations (at least 0.1 mm, to be seen) along the principal axes."""
     variance, axes = np.linalg.eigh(covariance)
     axes = axes * np.sign(np.linalg.det(axes))

@@ -1,4 +1,6 @@
-"""Names of topics, as ROS resolves them; without rclpy, as the launch files need them."""
+"""Names of topics, and how ROS resolves them; without rclpy, as the launch files need them."""
+
+DEPTH_INPUT, INFO_INPUT, POSE_INPUT = "depth/image_rect", "depth/camera_info", "camera_pose"  # of all three nodes
 
 
 def resolved(topic: str, namespace: str, node: str) -> str:

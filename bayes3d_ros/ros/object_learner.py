@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -37,8 +36,8 @@ from bayes3d_ros.ros.diagnostics import (
     WARN,
     InputView,
     diagnostic_array,
-    notes,
-    warnings,
+    input_notes,
+    input_warnings,
     where_images_are,
     why_no_input,
 )
@@ -48,11 +47,10 @@ from bayes3d_ros.ros.parameters import (
     ObjectLearnerNodeSettings,
     Settings,
 )
-from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.qos import LATCHED
+from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.summary import key_values
 from bayes3d_ros.settings import LearnerSettings
-
-_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 _Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
 
@@ -76,7 +74,7 @@ class ObjectLearnerNode(Node):
         self._seen: dict[int, Thing] = {}  # what the captures of `_seen_of` show, by stamp
         self._seen_of: Path | None = None
         self._last = ""
-        self._model = self.create_publisher(PointCloud2, "~/model", _LATCHED)
+        self._model = self.create_publisher(PointCloud2, "~/model", LATCHED)
         for name, action in (("capture", self._capture), ("build", self._build), ("reset", self._reset)):
             self.create_service(Trigger, f"~/{name}", self._answer(name, action))
         self._listen()
@@ -273,7 +271,7 @@ class ObjectLearnerNode(Node):
             dropped=str(self._parts.dropped),
             waiting=str(view.waiting),
             camera_pose=view.pose_source,
-            notes="; ".join([*warnings(view), *notes(view)]),
+            notes="; ".join([*input_warnings(view), *input_notes(view)]),
             last=self._last,
         )
         return diagnostic_array(status)
@@ -293,14 +291,14 @@ class ObjectLearnerNode(Node):
         if self._newest.pose.T_table_camera is None:
             why = self._newest.pose.problem or "expected one from the camera_pose topic, tf or the parameter"
             return WARN, f"no camera pose for the newest image: {why}"
-        told = warnings(view)
+        told = input_warnings(view)
         return (WARN, f"ready to capture; {'; '.join(told)}") if told else (OK, "ready to capture")
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
     check_arguments("object_learner", _PURPOSE, args)
-    return run(ObjectLearnerNode, args)
+    return run_node(ObjectLearnerNode, args)
 
 
 if __name__ == "__main__":

@@ -291,14 +291,14 @@ def yaml_text(node_name: str, kinds: tuple[type, ...]) -> str:
     ]
     for kind in kinds:
         for field in fields(kind):
-            comment = f"{field.metadata['description']}{_limits(field)}"
+            comment = f"{field.metadata['description']}{_range_text(field)}"
             lines += [f"    # {line}" for line in textwrap.wrap(comment, 110)]
             value = parameter_value(field)
             lines.append(f"    {field.name}: {yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}")
     return "\n".join(lines) + "\n"
 
 
-def _limits(field: Field) -> str:
+def _range_text(field: Field) -> str:
     meta, parts = field.metadata, []
     if meta["unit"]:
         parts.append(meta["unit"])

@@ -11,7 +11,7 @@ from bayes3d_ros.ros.input_queue import JUMP_NS
 
 Matrix = Float[np.ndarray, "4 4"]
 
-_MOST = 20_000  # poses
+_MOST_POSES = 20_000  # poses
 _STREAM_NS = 1_000_000_000  # between the stamps of latched poses that change because the camera moves
 _STREAM = 3  # such poses in a row
 
@@ -109,7 +109,7 @@ class PoseHistory:
         if stamp_ns not in self._poses:
             insort(self._stamps, stamp_ns)
         self._poses[stamp_ns] = pose, now
-        first = max(bisect_left(self._stamps, self._stamps[-1] - self._keep_ns), len(self._stamps) - _MOST)
+        first = max(bisect_left(self._stamps, self._stamps[-1] - self._keep_ns), len(self._stamps) - _MOST_POSES)
         if first > 0:
             for old in self._stamps[:first]:
                 del self._poses[old]

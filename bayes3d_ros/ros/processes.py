@@ -12,6 +12,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+START_SECONDS = 600.0  # how long to wait for a node: its first start on a machine compiles for minutes
+
 
 def free_domain() -> int:
     """A ROS domain that no other process on this machine has taken by this function, and in which nobody listens for

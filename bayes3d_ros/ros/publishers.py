@@ -5,7 +5,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
 from rclpy.lifecycle import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
@@ -15,17 +15,15 @@ from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros import conversions
 from bayes3d_ros.ros.detections import detection_array, detections_type
 from bayes3d_ros.ros.markers import SceneMarkers
+from bayes3d_ros.ros.qos import LATCHED, RELIABLE
 from bayes3d_ros.ros.summary import summary_message
-
-_RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class ScenePublishers:
     """The output topics. Publishes from any thread; nothing goes out unless the node is active."""
 
     def __init__(self, node: Node) -> None:
-        def publisher(kind: Any, name: str, qos: QoSProfile = _RELIABLE) -> Any:
+        def publisher(kind: Any, name: str, qos: QoSProfile = RELIABLE) -> Any:
             return node.create_lifecycle_publisher(kind, f"~/{name}", qos)
 
         self._poses = publisher(PoseArray, "poses")
@@ -34,7 +32,7 @@ class ScenePublishers:
         self._reconstruction = publisher(Image, "depth_reconstruction")
         self._posterior = publisher(PointCloud2, "posterior")
         self._summary = publisher(DiagnosticArray, "summary")
-        self._library = publisher(String, "library", _LATCHED)
+        self._library = publisher(String, "library", LATCHED)
         detections = detections_type()
         self._detections = None if detections is None else publisher(detections, "detections")
 

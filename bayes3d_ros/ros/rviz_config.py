@@ -6,7 +6,7 @@ import yaml
 
 from bayes3d_ros.resources import share_directory
 
-NODE, DEPTH = "/scene_parser", "/depth/image_rect"  # in the file, which fits a node of that name as it is
+NODE_IN_FILE, IMAGE_IN_FILE = "/scene_parser", "/depth/image_rect"  # it fits a node of that name as it is
 # image_transport takes the CameraInfo of an image from this name beside it; RViz has no setting for it.
 INFO_BESIDE_IMAGE = "camera_info"
 
@@ -21,10 +21,10 @@ def rviz_config(node: str, depth: str, frame: str) -> str:
             return {key: named(item) for key, item in value.items()}
         if isinstance(value, list):
             return [named(item) for item in value]
-        if value == DEPTH:
+        if value == IMAGE_IN_FILE:
             return depth
-        if isinstance(value, str) and value.startswith(f"{NODE}/"):
-            return node + value.removeprefix(NODE)
+        if isinstance(value, str) and value.startswith(f"{NODE_IN_FILE}/"):
+            return node + value.removeprefix(NODE_IN_FILE)
         return value
 
     return yaml.safe_dump(named(config), sort_keys=False)

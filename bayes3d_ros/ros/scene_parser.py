@@ -25,7 +25,7 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.prepared import MakeParser, Prepared, prepare
 from bayes3d_ros.ros.publishers import ScenePublishers
-from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
 
 _PARSER_PARAMETERS = {f.name for f in fields(ParserSettings)}
@@ -264,7 +264,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the node."""
     check_arguments("scene_parser", _PURPOSE, args)
     prepare_jax()
-    return run(SceneParserNode, args)
+    return run_node(SceneParserNode, args)
 
 
 if __name__ == "__main__":

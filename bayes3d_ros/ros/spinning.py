@@ -26,7 +26,7 @@ class StoppableNode(Protocol):
         ...
 
 
-def run(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -> NoReturn:
+def run_node(make_node: Callable[[], StoppableNode], args: list[str] | None = None) -> NoReturn:
     """Spin a node until SIGINT, SIGTERM or a shutdown of ROS, then end the process; its exit status is 0 for all of
     them.
 

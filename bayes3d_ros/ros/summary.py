@@ -36,8 +36,8 @@ def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> Diagn
     status.values = key_values(
         p_exists=f"{estimate.probability:.4f}",
         p_type=" ".join(f"{name}: {p:.3f}" for name, p in estimate.type_probabilities.items()),
-        position_m=_numbers(estimate.position, 4),
-        orientation_xyzw=_numbers(estimate.orientation, 4),
+        position_m=spaced(estimate.position, 4),
+        orientation_xyzw=spaced(estimate.orientation, 4),
         sigma_position_mm=sigma_position,
         sigma_rotation_deg=sigma_rotation,
         contact_face=str(estimate.contact_face),
@@ -52,7 +52,7 @@ def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> Diagn
 def _mode(mode: PoseMode) -> str:
     sigma_position, sigma_rotation = _sigmas(mode.covariance)
     return (
-        f"p {mode.weight:.3f}, m {_numbers(mode.position, 4)}, xyzw {_numbers(mode.orientation, 4)}, "
+        f"p {mode.weight:.3f}, m {spaced(mode.position, 4)}, xyzw {spaced(mode.orientation, 4)}, "
         f"sigma mm {sigma_position}, sigma deg {sigma_rotation}, face {mode.contact_face}"
     )
 
@@ -60,8 +60,9 @@ def _mode(mode: PoseMode) -> str:
 def _sigmas(covariance: np.ndarray) -> tuple[str, str]:
     """Standard deviations in millimetres and degrees."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return _numbers(sigma[:3] * 1e3, 2), _numbers(np.degrees(sigma[3:]), 2)
+    return spaced(sigma[:3] * 1e3, 2), spaced(np.degrees(sigma[3:]), 2)
 
 
-def _numbers(values: np.ndarray, digits: int) -> str:
+def spaced(values: np.ndarray, digits: int) -> str:
+    """Numbers with so many decimals, with spaces between them."""
     return " ".join(f"{v:.{digits}f}" for v in values)

@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
+from bayes3d_ros.ros.qos import LATCHED
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 NAME = "/scene_parser: scene parsing"
 

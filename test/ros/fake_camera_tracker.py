@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from bayes3d_ros.ros.camera_tracker import CameraTrackerNode
-from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, TrackingError
 
 
@@ -49,4 +49,4 @@ class FakeFollower:
 
 
 if __name__ == "__main__":
-    sys.exit(run(lambda: CameraTrackerNode(FakeFollower), sys.argv))
+    sys.exit(run_node(lambda: CameraTrackerNode(FakeFollower), sys.argv))

@@ -10,7 +10,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.ros.scene_parser import SceneParserNode
-from bayes3d_ros.ros.spinning import run
+from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
 
 
@@ -76,4 +76,4 @@ if __name__ == "__main__":
     options = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=False))
     FakeParser.seconds = float(options.get("--seconds", 0))
     FakeParser.compiling = float(options.get("--compiling", 0))
-    sys.exit(run(lambda: SceneParserNode(FakeParser), sys.argv))
+    sys.exit(run_node(lambda: SceneParserNode(FakeParser), sys.argv))

@@ -13,7 +13,7 @@ from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
 from bayes3d_ros.ros import conversions, detections
-from bayes3d_ros.ros.markers import SceneMarkers, ellipsoid
+from bayes3d_ros.ros.markers import SceneMarkers, principal_axes
 from bayes3d_ros.ros.summary import summary_message
 
 
@@ -188,7 +188,7 @@ def test_markers_delete_the_old_ones_first_and_are_unique(library) -> None:
 def test_an_ellipsoid_has_the_covariance_it_was_made_from() -> None:
     A = np.random.default_rng(3).normal(size=(3, 3)) * 1e-2
     covariance = A @ A.T + 1e-6 * np.eye(3)
-    quaternion, sigma = ellipsoid(covariance)
+    quaternion, sigma = principal_axes(covariance)
     R = conversions.matrix_from_values([0, 0, 0, *quaternion])[:3, :3]
     np.testing.assert_allclose(R @ np.diag(sigma**2) @ R.T, covariance, atol=1e-12)
 

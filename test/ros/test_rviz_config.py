@@ -61,10 +61,10 @@ def test_every_topic_is_one_of_the_node(ros, library_folder, namespace: str, nam
 def test_nothing_of_the_defaults_is_left_and_the_frame_is_set() -> None:
     text = rviz_config("/left/kitchen", "/front/depth", "front_optical_frame")
     found = list(strings(yaml.safe_load(text)))
-    assert not [value for value in found if "scene_parser" in value or value == module.DEPTH]
+    assert not [value for value in found if "scene_parser" in value or value == module.IMAGE_IN_FILE]
     assert yaml.safe_load(text)["Visualization Manager"]["Global Options"]["Fixed Frame"] == "front_optical_frame"
 
 
 def test_with_the_defaults_it_is_the_file_itself() -> None:
-    text = rviz_config(module.NODE, module.DEPTH, "camera_depth_optical_frame")
+    text = rviz_config(module.NODE_IN_FILE, module.IMAGE_IN_FILE, "camera_depth_optical_frame")
     assert yaml.safe_load(text) == yaml.safe_load((share_directory() / "config" / "bayes3d.rviz").read_text())

@@ -5,29 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_rig import INTRINSICS
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
-from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import BagWriter
 from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros.demo import OUTPUTS
 from bayes3d_ros.ros.processes import shared_memory
-
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
-OUTPUTS = {
-    "poses": PoseArray,
-    "objects": MarkerArray,
-    "segmentation": Image,
-    "depth_reconstruction": Image,
-    "posterior": PointCloud2,
-    "summary": DiagnosticArray,
-}
+from bayes3d_ros.ros.qos import LATCHED
 
 
 def depth_frame(k: int, height: float | None = None) -> DepthFrame:

@@ -9,16 +9,15 @@ import pytest
 from camera_rig import INTRINSICS, Rig, drive
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, TransformStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
+from bayes3d_ros.ros.qos import LATCHED
 
 pytest.importorskip("tf2_ros", reason="tf2_ros is not on PyPI")
 TFMessage: Any = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not on PyPI").TFMessage
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DEPTH = np.full((48, 64), 0.8, np.float32)
 
 
