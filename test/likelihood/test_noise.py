@@ -77,7 +77,7 @@ def test_adding_a_constant_to_the_table_adds_it_to_the_marginal(grid):
     table = table_of(residuals(200, *NOISES[0]), grid)
     table = jnp.float32(table - table.max())
     values = np.asarray(marginal(jnp.stack([table, table + 512, table - 4096]), grid))
-    np.testing.assert_allclose(values - values[0], [0, 512, -4096], atol=2e-3)
+    np.testing.assert_allclose(values - values[0], [0, 512, -4096], atol=6e-5)  # measured: 3e-5
 
 
 @pytest.mark.parametrize("count", [100, 1000, 5000, 20000])
@@ -113,8 +113,8 @@ def test_samples_follow_the_posterior(grid, count):
         for values, axis, share in axes:
             mean = share @ axis
             spread = np.sqrt(share @ (axis - mean) ** 2)
-            assert abs(values.mean() - mean) < 0.1 * spread
-            assert abs(values.std() / spread - 1) < 0.06
+            assert abs(values.mean() - mean) < 0.075 * spread  # measured: at most 0.038
+            assert abs(values.std() / spread - 1) < 0.06  # 0.034
 
 
 def _logit(p):
@@ -126,15 +126,16 @@ def _logit(p):
 def test_samples_recover_the_truth(grid, sigma, p):
     table = table_of(residuals(8000, sigma, p, seed=2), grid)
     drawn = draw(jax.random.key(1), jnp.broadcast_to(jnp.float32(table - table.max()), (200, *table.shape)), grid)
-    assert abs(np.mean(drawn.sigma) / sigma - 1) < 0.05
-    assert abs(np.mean(drawn.p_outlier) - p) < 4 * np.sqrt(p * (1 - p) / 8000)
+    assert abs(np.mean(drawn.sigma) / sigma - 1) < 0.004  # measured: at most 0.0018
+    # Standard errors of a share; measured: at most 1.5.
+    assert abs(np.mean(drawn.p_outlier) - p) < 3 * np.sqrt(p * (1 - p) / 8000)
 
 
 def test_each_particle_draws_from_its_own_table(grid):
     tables = np.stack([table_of(residuals(3000, *noise), grid) for noise in NOISES])
     drawn = draw(jax.random.key(2), jnp.float32(tables - tables.max((1, 2), keepdims=True)), grid)
-    np.testing.assert_allclose(drawn.sigma, [n[0] for n in NOISES], rtol=0.15)
-    np.testing.assert_allclose(drawn.p_outlier, [n[1] for n in NOISES], atol=0.05)
+    np.testing.assert_allclose(drawn.sigma, [n[0] for n in NOISES], rtol=0.1)  # measured: 0.051
+    np.testing.assert_allclose(drawn.p_outlier, [n[1] for n in NOISES], atol=0.03)  # 0.015
 
 
 def test_peak_is_the_best_of_the_coarse_grid(grid):
@@ -142,7 +143,9 @@ def test_peak_is_the_best_of_the_coarse_grid(grid):
     best = peak(jnp.float32(table), grid)
     s, q = np.unravel_index(table.argmax(), table.shape)
     assert best.sigma.shape == best.p_outlier.shape == (1,)
-    assert float(best.sigma[0]) == float(grid.coarse.sigma[s]) and abs(np.log(float(best.sigma[0]) / 0.002)) < 0.2
+    assert (
+        float(best.sigma[0]) == float(grid.coarse.sigma[s]) and abs(np.log(float(best.sigma[0]) / 0.002)) < 0.02
+    )  # measured: 0.008; a step is 0.23
     assert float(best.p_outlier[0]) == float(grid.coarse.p_outlier[q])
 
 

@@ -115,7 +115,7 @@ def test_integrates_to_one_over_free_points(sigma, tolerance):
     inlier = np.asarray(density(window, pixels, jnp.array([sigma]), WINDOW), np.float64)[0]
     cells = np.tile(dz, parts**2) / parts**2 / (shape[0] * shape[1])  # of (u, v, z), u and v over the image
     inliers, outliers = (inlier * cells).sum(), (SCALE * np.broadcast_to(z, shape) ** 2 * cells).sum()
-    assert outliers == pytest.approx(1, abs=2e-4)
+    assert outliers == pytest.approx(1, abs=3e-5)  # measured: 1.5e-5
     assert 1 - tolerance < inliers < 1 + 2e-4
     # A surface more or less changes nothing: p is normalised by the image, not by what is seen.
     assert 0.2 < np.isfinite(rendered).mean() < 0.4
@@ -169,5 +169,5 @@ def test_on_depth_images_points_are_too_sure_of_the_noise(sigma):
     depth = (rendered + sigma / norm * rng.normal(size=rendered.shape))[..., None]
     pixels = {name: make_pixels(depth, likelihood=name, focal=focal) for name in likelihoods}
     found = {name: best_sigma(rendered, seen, sigma) for name, seen in pixels.items()}
-    assert found["depth"] == pytest.approx(sigma, rel=0.05)
-    assert found["points"] == pytest.approx(sigma / np.sqrt(3), rel=0.05)
+    assert found["depth"] == pytest.approx(sigma, rel=0.05)  # measured: 0.045
+    assert found["points"] == pytest.approx(sigma / np.sqrt(3), rel=0.03)  # 0.016

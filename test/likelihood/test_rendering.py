@@ -74,10 +74,10 @@ def test_like_the_reference(cast, library, type_id):
         hit &= np.isfinite(fast)
         away.append((fast[hit] - slow[hit]) / model.voxel_size)
     away = np.concatenate(away)
-    assert away.min() > -0.002
-    assert np.mean(away) < 0.03
-    assert np.mean(away > 0.1) < 0.05
-    assert np.quantile(away, 0.99) < 0.4
+    assert away.min() > -2e-4  # voxels; measured, of the worst of the types: -1.0e-4
+    assert np.mean(away) < 0.03  # 0.015
+    assert np.mean(away > 0.1) < 0.05  # 0.041
+    assert np.quantile(away, 0.99) < 0.4  # 0.32
 
 
 def test_rounding_planes_to_bytes_moves_surfaces_little(library):
