@@ -11,9 +11,9 @@ from scipy.stats import binom, kstwo
 
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import GREY, open_frame
 from bayes3d_ros.validation.statistics.ranks import reliability
 
-GREY = "#666666"
 NAMES = {
     "n": "number of objects", "x": "x", "y": "y", "yaw": "yaw", "sigma": "sigma", "p_outlier": "p_outlier",
     "log_likelihood": "log p(image | scene)",
@@ -53,7 +53,7 @@ def _histogram(axis: Axes, ranks: np.ndarray, title: str) -> None:
     axis.axhline(middle, color=GREY, linewidth=1)
     axis.hist(ranks, bins=bins, range=(0, 1), color=colour(1), alpha=0.75, rwidth=0.92, zorder=2)
     axis.set_title(title, fontsize=10, color=INK, loc="left")
-    _dress(axis)
+    _open_with_small_ticks(axis)
 
 
 def _difference(axis: Axes, ranks: np.ndarray) -> None:
@@ -67,7 +67,7 @@ def _difference(axis: Axes, ranks: np.ndarray) -> None:
     x = np.concatenate([[0], np.repeat(at, 2), [1]])
     axis.plot(x, np.repeat(steps, 2) - x, color=colour(1), linewidth=1.3)
     axis.set_xlabel("rank", color=INK)
-    _dress(axis)
+    _open_with_small_ticks(axis)
 
 
 def _reliability(axis: Axes, rows: Sequence[Row], name: str) -> None:
@@ -87,9 +87,9 @@ def _reliability(axis: Axes, rows: Sequence[Row], name: str) -> None:
     axis.set_ylabel("share that came true", color=INK)
     title = f"p({name}): predictions in ten bins, their number; grey: {_INSIDE:.0%} if they are right"
     axis.set_title(title, fontsize=10, color=INK, loc="left")
-    _dress(axis)
+    _open_with_small_ticks(axis)
 
 
-def _dress(axis: Axes) -> None:
+def _open_with_small_ticks(axis: Axes) -> None:
     axis.tick_params(labelsize=8, colors=INK)
-    axis.spines[["top", "right"]].set_visible(False)
+    open_frame(axis)

@@ -25,6 +25,7 @@ from bayes3d_ros.tracking.camera_estimate import KnownWorld
 from bayes3d_ros.tracking.tracker import CameraTracker
 from bayes3d_ros.validation.bench.benchmark import ycb_library, ycb_mesh
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.simulate.panning_camera import independent_frames, own_frames, panning_cameras
 from bayes3d_ros.validation.statistics.metrics import rotation_error_degrees, translation_error
 
@@ -213,7 +214,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         axis.minorticks_off()
         axis.set_xlabel("pixels across", color=INK)
         axis.set_title(title, loc="left", fontsize=10, color=INK)
-        axis.spines[["top", "right"]].set_visible(False)
+        open_frame(axis)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=7, frameon=False)
     path = folder / "camera-tracking.png"
     figure.savefig(path, dpi=110)

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
 from bayes3d_ros.validation.statistics.credible_regions import coverage
 
 CURVES = ("x", "y", "position", "yaw", "pose")
 WORDS = {"position": "position (ellipse)", "pose": "position and yaw (ellipsoid)"}
-GREY = "#666666"
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
@@ -47,7 +47,8 @@ def _curves(axis: Axes, rows: Sequence[Row], label: str) -> None:
             share = [coverage(levels, p).share for p in nominal]
             axis.plot(nominal, share, color=colour(k + 1), linewidth=1.6, label=WORDS.get(name, name))
     axis.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
-    _dress(
+    open_frame(axis)
+    label_plot(
         axis, "probability of the region", "share of scenes in which it holds the truth", f"{label}, {len(rows)} scenes"
     )
     axis.legend(fontsize=8, frameon=False, loc="upper left", title="grey: right, 2 binomial errors", title_fontsize=8)
@@ -77,13 +78,7 @@ def _widths(axis: Axes, rows: Sequence[Row], name: str, scale: float, unit: str,
     for side in (axis.xaxis, axis.yaxis):
         side.set_major_formatter(lambda value, _: f"{value:g}")
     title = {"position": "Position on the table", "yaw": "Yaw, symmetry taken out"}[name]
-    _dress(axis, f"half of the 90 % region's width, {unit}", f"error of the mean, {unit}", title)
+    open_frame(axis)
+    label_plot(axis, f"half of the 90 % region's width, {unit}", f"error of the mean, {unit}", title)
     if name == "position":
         axis.legend(fontsize=7.5, frameon=False, loc="lower right")
-
-
-def _dress(axis: Axes, x: str, y: str, title: str) -> None:
-    axis.set_xlabel(x, color=INK)
-    axis.set_ylabel(y, color=INK)
-    axis.set_title(title, fontsize=10, color=INK, loc="left")
-    axis.spines[["top", "right"]].set_visible(False)

@@ -19,6 +19,7 @@ from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_library
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import open_frame
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -132,7 +133,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         ticks = sorted({row["particles"] for row in rows})
         axis.set_xticks(ticks, [str(n) for n in ticks])
         axis.set_ylim(bottom=0)
-        axis.spines[["top", "right"]].set_visible(False)
+        open_frame(axis)
     if rows:
         axes[0].legend(frameon=False, fontsize=9)
     path = folder / "dial.png"

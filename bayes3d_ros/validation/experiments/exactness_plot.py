@@ -12,10 +12,11 @@ from matplotlib.ticker import MaxNLocator
 
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.reference.small_problems import TABLE_SIZE
 from bayes3d_ros.validation.statistics.agreement import evidence_weights, log_mean, number_of_objects, ratio_and_error
 
-GREY = "#888888"
+BAND_GREY = "#888888"
 _SHOWN = 0.005  # of the best: bins with less, at the ends, and kinds that are less likely are left out
 _FEW = 25  # runs: a histogram of fewer has fewer bins
 
@@ -46,7 +47,7 @@ def _problem(axes: Sequence[Axes], exact: Row, seeds: Sequence[Row]) -> None:
         seen = np.flatnonzero(values[order] > _SHOWN * values.max())
         seen = np.arange(max(int(seen[0]) - 3, 0), min(int(seen[-1]) + 4, len(values)))
         _marginal(axis, values[order][seen], runs[:, order][:, seen], weight, _edges(name, order[seen], len(values)))
-        _dress(axis, "yaw, degrees" if name == "yaw" else f"{name}, mm from the table's middle")
+        _name_below(axis, "yaw, degrees" if name == "yaw" else f"{name}, mm from the table's middle")
     axes[0].set_title(exact["problem"], loc="left", fontsize=11, color=INK)
     _kinds(axes[3], exact, seeds, weight)
     _errors(axes[4], exact, seeds)
@@ -72,7 +73,7 @@ def _edges(name: str, bins: Int[np.ndarray, "B"], count: int) -> Float[np.ndarra
 def _marginal(axis: Axes, exact: np.ndarray, runs: np.ndarray, weight: np.ndarray, edges: np.ndarray) -> None:
     if len(runs):
         low, high = np.quantile(runs, (0.05, 0.95), axis=0)
-        axis.stairs(high, edges, baseline=low, fill=True, color=GREY, alpha=0.3, label="90 % of the runs")
+        axis.stairs(high, edges, baseline=low, fill=True, color=BAND_GREY, alpha=0.3, label="90 % of the runs")
         axis.stairs(weight @ runs, edges, color=colour(1), linewidth=2, label="all runs, weighted by their Z")
     axis.stairs(exact, edges, color=INK, linewidth=1.1, linestyle=(0, (3, 2)), label="enumerated")
     axis.set_ylim(bottom=0)
@@ -98,12 +99,12 @@ def _kinds(axis: Axes, exact: Row, seeds: Sequence[Row], weight: np.ndarray) -> 
     axis.bar(place, true, width=0.7, color="none", edgecolor=INK, linewidth=1.1, linestyle=(0, (3, 2)))
     for k, each in enumerate(runs):
         if len(each):
-            axis.vlines(k, *np.quantile(each, (0.05, 0.95)), color=GREY, alpha=0.5, linewidth=8)
+            axis.vlines(k, *np.quantile(each, (0.05, 0.95)), color=BAND_GREY, alpha=0.5, linewidth=8)
             axis.plot(k, mixed[k], "o", color=colour(1), markersize=5)
     axis.set_xticks(place, names)
     axis.set_xlim(-0.8, max(len(names), 3) - 0.2)
     axis.set_ylim(0, 1.05)
-    _dress(axis, "probability of type, face, number of objects")
+    _name_below(axis, "probability of type, face, number of objects")
 
 
 def _errors(axis: Axes, exact: Row, seeds: Sequence[Row]) -> None:
@@ -117,11 +118,10 @@ def _errors(axis: Axes, exact: Row, seeds: Sequence[Row]) -> None:
         axis.set_title(title, fontsize=9, color=INK)
     axis.axvline(0, color=INK, linewidth=1.1, linestyle=(0, (3, 2)))
     axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-    _dress(axis, f"log Z of {len(errors)} runs - log Z enumerated, nats")
+    _name_below(axis, f"log Z of {len(errors)} runs - log Z enumerated, nats")
 
 
-def _dress(axis: Axes, x: str) -> None:
+def _name_below(axis: Axes, x: str) -> None:
     axis.set_xlabel(x, fontsize=8, color=INK)
     axis.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    open_frame(axis)

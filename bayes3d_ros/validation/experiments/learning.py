@@ -24,6 +24,7 @@ from bayes3d_ros.settings import LearnerSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_mesh
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.parsing import Surfaces, estimated_pose
+from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors
 from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, RestingObject, resting_object
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster
@@ -186,7 +187,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         axis.set_title(title, loc="left", fontsize=10, color=INK)
         axis.set_xlabel("views")
         axis.set_ylim(bottom=0)
-        axis.spines[["top", "right"]].set_visible(False)
+        open_frame(axis)
     axes[1].legend(frameon=False, fontsize=7, loc="lower right")
     path = folder / "learning.png"
     figure.savefig(path, dpi=100)

@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot
 
 LIMIT_MM = 10.0  # ADD-S that is asked for where at least half of an object is visible
 COLUMNS = (
     *((0.0, "recording"), (0.35, "types"), (0.45, "frames"), (0.57, "found")),
     *((0.72, "false"), (0.82, "p(n)"), (0.94, "s")),
 )
-GREY, FAILED = "#666666", "#B22222"
+FAILED = "#B22222"
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
@@ -54,7 +55,7 @@ def _accuracy(axis: Axes, objects: list[Row], types: list[str]) -> None:
         x, y = [row["visible_fraction"] for row in missed], [top] * len(missed)
         axis.scatter(x, y, color=FAILED, marker="x", s=50, label="not found")
     axis.set(xlim=(0, 1.05), ylim=(0, top * 1.1))
-    _dress(axis, "visible fraction (types side by side)", "ADD-S, mm", "How far off, by how much is visible")
+    _label_over_grid(axis, "visible fraction (types side by side)", "ADD-S, mm", "How far off, by how much is visible")
     if found or missed:
         axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.8))
 
@@ -77,7 +78,7 @@ def _honesty(axis: Axes, found: list[Row], types: list[str]) -> None:
     for side in (axis.xaxis, axis.yaxis):
         side.set_major_formatter(lambda value, _: f"{value:g}")
     covered = f"{sum(row['covered'] for row in found)} of {len(found)} within the 95 % region"
-    _dress(axis, "stated sigma of the position, mm", "true error of the position, mm", f"How sure: {covered}")
+    _label_over_grid(axis, "stated sigma of the position, mm", "true error of the position, mm", f"How sure: {covered}")
 
 
 def _dots(k: int, real: bool) -> dict[str, Any]:
@@ -109,10 +110,8 @@ def _recordings(axis: Axes, rows: Sequence[Row]) -> None:
             axis.text(x, 0.95 - step * (k + 1), text, fontsize=9.5, color=FAILED if bad else INK, va="top")
 
 
-def _dress(axis: Axes, x: str, y: str, title: str) -> None:
-    axis.set_xlabel(x, fontsize=9, color=INK)
-    axis.set_ylabel(y, fontsize=9, color=INK)
-    axis.set_title(title, fontsize=10, color=INK)
+def _label_over_grid(axis: Axes, x: str, y: str, title: str) -> None:
+    label_plot(axis, x, y, title, size=9, side="center")
     axis.tick_params(labelsize=8, colors=INK)
     axis.grid(color="#e6e6e6", linewidth=0.7)
     axis.set_axisbelow(True)

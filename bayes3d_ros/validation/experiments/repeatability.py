@@ -21,6 +21,7 @@ from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_library
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.parsing import notes, recordings
+from bayes3d_ros.validation.experiments.plot_style import open_frame
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -158,7 +159,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         axis.axhline(limit, color=INK, linestyle="--", linewidth=1)
         axis.set_xticks(range(len(bags)), bags, rotation=25, ha="right", fontsize=8)
         axis.set_ylim(bottom=0)
-        axis.spines[["top", "right"]].set_visible(False)
+        open_frame(axis)
     path = folder / "repeatability.png"
     figure.savefig(path, dpi=110)
     return [path]
