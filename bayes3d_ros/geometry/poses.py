@@ -1,11 +1,15 @@
 """Rigid transforms as 4 x 4 matrices."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 
-def pose_matrix(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
+def pose_matrix(
+    position: Float[np.ndarray, "3"] | Sequence[float], quaternion: Float[np.ndarray, "4"] | Sequence[float]
+) -> Float[np.ndarray, "4 4"]:
     """The transform with this position (metres) and orientation (x y z w, of about length one)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
@@ -13,7 +17,7 @@ def pose_matrix(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, 
 
 
 def slide(
-    x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], yaw: Float[np.ndarray, "*n"]
+    x: Float[np.ndarray, "*n"] | float, y: Float[np.ndarray, "*n"] | float, yaw: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n 4 4"]:
     """The motion by (x, y) along a plane z = 0, after a turn about z; metres and radians."""
     T, c, s = np.zeros((*np.shape(yaw), 4, 4)), np.cos(yaw), np.sin(yaw)

@@ -84,12 +84,12 @@ def inlier_density(
     sigma: Float[Array, "S"],
     window: int,
     lateral: float | Float[Array, ""] = LATERAL,
-) -> Float[Array, "S h w T"]:
+) -> Float[Array, "S h w _"]:
     """The mixture over the window for every sigma, per metre; `rendered` has a border of window // 2 pixels around."""
     half = window // 2
     height, width = pixels.depth.shape[:2]
 
-    def beside(dv: int, du: int) -> Float[Array, "h w T"]:
+    def beside(dv: int, du: int) -> Float[Array, "h w _"]:
         return rendered[half + dv : half + dv + height, half + du : half + du + width]
 
     # All sigmas in one expression of the window: a copy of it for each would be slower, and slow to compile.

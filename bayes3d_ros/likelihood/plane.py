@@ -15,7 +15,7 @@ def upper_side(T_camera_frame: Float[Array, "*n 4 4"]) -> tuple[Float[Array, "*n
 
 
 def plane_depth(
-    normal: Sequence[Array], offset: Array, x: Float[Array, "*shape"], y: Float[Array, "*shape"]
+    normal: Sequence[Array] | Array, offset: Array, x: Float[Array, "*shape"], y: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
     """Depth along rays (x, y, 1) of the points p with normal . p = offset, NO_SURFACE where the side that the normal
     points to is not met."""

@@ -21,10 +21,10 @@ from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
-from bayes3d_ros.ros.conversions import camera_particles, camera_pose_message, frame_from_messages, path_pose
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
+from bayes3d_ros.ros.from_messages import frame_from_messages
 from bayes3d_ros.ros.parameters import (
     CAMERA_TRACKER_SETTINGS,
     DEPTH_INPUT_PARAMETERS,
@@ -32,6 +32,7 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.qos import RELIABLE
 from bayes3d_ros.ros.spinning import run_node
+from bayes3d_ros.ros.to_messages import camera_particles, camera_pose_message, path_pose
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.session import CameraFollower

@@ -26,11 +26,11 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.conversions import matrix_from_values
 from bayes3d_ros.ros.detections import detections_type
+from bayes3d_ros.ros.from_messages import matrix_from_values
+from bayes3d_ros.ros.posterior_from_messages import posterior_from_messages, stamp_of
 from bayes3d_ros.ros.processes import START_SECONDS, NodeProcess, free_domain
 from bayes3d_ros.ros.qos import LATCHED
-from bayes3d_ros.ros.received import posterior_from_messages, stamp_of
 from bayes3d_ros.ros.spinning import shut_down
 from bayes3d_ros.ros.summary import spaced
 from bayes3d_ros.validation.statistics.metrics import add_s

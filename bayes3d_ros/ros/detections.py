@@ -5,7 +5,8 @@ from typing import Any
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.summarise import modes_by_type
 from bayes3d_ros.posterior.types import ScenePosterior
-from bayes3d_ros.ros.conversions import header, matrix_from_values, matrix_to_pose, pose_message
+from bayes3d_ros.ros.from_messages import matrix_from_values
+from bayes3d_ros.ros.to_messages import header, matrix_to_pose, pose_message
 
 try:
     from vision_msgs import msg as vision

@@ -15,8 +15,8 @@ from sensor_msgs.msg import Image
 
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.posterior_from_messages import stamp_of
 from bayes3d_ros.ros.processes import START_SECONDS, NodeProcess, free_domain
-from bayes3d_ros.ros.received import stamp_of
 from bayes3d_ros.ros.spinning import shut_down
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, Case, line, parsing_row, ycb_library
 from bayes3d_ros.validation.bench.speed_rows import SpeedRow

@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from bayes3d_ros.objects.model import Library, ObjectModel
 from bayes3d_ros.posterior.types import ScenePosterior
-from bayes3d_ros.ros.conversions import header, pose_message
+from bayes3d_ros.ros.to_messages import header, pose_message
 
 _TEXT_HEIGHT = 0.02  # metres
 

@@ -27,7 +27,6 @@ from bayes3d_ros.learning.segment import Thing, ViewError, segment
 from bayes3d_ros.objects.model import LibraryError
 from bayes3d_ros.objects.store import learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.ros.arguments import check_arguments
-from bayes3d_ros.ros.conversions import cloud_message, frame_from_messages, ns_to_stamp, stamp_to_ns
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import DepthNodeParts
 from bayes3d_ros.ros.diagnostics import (
@@ -41,6 +40,7 @@ from bayes3d_ros.ros.diagnostics import (
     where_images_are,
     why_no_input,
 )
+from bayes3d_ros.ros.from_messages import frame_from_messages, stamp_to_ns
 from bayes3d_ros.ros.parameters import (
     DEPTH_INPUT_PARAMETERS,
     OBJECT_LEARNER_SETTINGS,
@@ -50,6 +50,7 @@ from bayes3d_ros.ros.parameters import (
 from bayes3d_ros.ros.qos import LATCHED
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.summary import key_values
+from bayes3d_ros.ros.to_messages import cloud_message, ns_to_stamp
 from bayes3d_ros.settings import LearnerSettings
 
 _Service = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bayes3d_ros.learning.learn import LearningError, check_name
-from bayes3d_ros.ros.conversions import matrix_from_values
+from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.settings import (
     RETIRED,
     LearnerSettings,

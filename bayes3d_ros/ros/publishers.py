@@ -12,7 +12,7 @@ from visualization_msgs.msg import MarkerArray
 
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.types import ScenePosterior
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import to_messages
 from bayes3d_ros.ros.detections import detection_array, detections_type
 from bayes3d_ros.ros.markers import SceneMarkers
 from bayes3d_ros.ros.qos import LATCHED, RELIABLE
@@ -38,14 +38,14 @@ class ScenePublishers:
 
     def library(self, library: Library) -> None:
         """Publish the names of the types."""
-        self._library.publish(conversions.library_message(library.names))
+        self._library.publish(to_messages.library_message(library.names))
 
     def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers) -> None:
         """Publish a scene on every topic."""
-        self._poses.publish(conversions.pose_array(posterior))
-        self._segmentation.publish(conversions.segmentation_image(posterior))
-        self._reconstruction.publish(conversions.reconstruction_image(posterior))
-        self._posterior.publish(conversions.posterior_cloud(posterior))
+        self._poses.publish(to_messages.pose_array(posterior))
+        self._segmentation.publish(to_messages.segmentation_image(posterior))
+        self._reconstruction.publish(to_messages.reconstruction_image(posterior))
+        self._posterior.publish(to_messages.posterior_cloud(posterior))
         if self._objects.get_subscription_count():  # thousands of points as Python objects
             self._objects.publish(markers(posterior))
         if self._detections is not None:

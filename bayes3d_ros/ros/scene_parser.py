@@ -13,17 +13,17 @@ from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, usable_note
 from bayes3d_ros.ros.arguments import check_arguments
-from bayes3d_ros.ros.conversions import frame_from_messages
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView
+from bayes3d_ros.ros.from_messages import frame_from_messages
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
-from bayes3d_ros.ros.prepared import MakeParser, Prepared, prepare
+from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
@@ -51,7 +51,7 @@ class SceneParserNode(Node):
             changed=self._parameters_changed,
             forbids=self._why_fixed,
         )
-        self._ready: Prepared | None = None  # replaced as a whole; the worker reads it once a frame
+        self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
         self._preparing_since: float | None = None
         self._requests = 0
         self._outputs = ScenePublishers(self)
@@ -66,7 +66,7 @@ class SceneParserNode(Node):
         """Load the library and compile, unless that has been done already."""
         try:
             if self._ready is None:
-                self._ready = prepare(self._make_parser, *self._load(), self._size())
+                self._ready = make_bundle(self._make_parser, *self._load(), self._size())
         except (ValueError, LibraryError) as error:
             self._parts.refuse(str(error))
             return TransitionCallbackReturn.FAILURE
@@ -143,11 +143,11 @@ class SceneParserNode(Node):
             if request != self._requests:
                 return  # a later request is on its way
             try:
-                prepared, refusal = prepare(self._make_parser, library, settings, size), ""
+                bundle, refusal = make_bundle(self._make_parser, library, settings, size), ""
             except Exception as error:
-                prepared, refusal = None, self._parts.failure(_CANNOT_COMPILE, error)
+                bundle, refusal = None, self._parts.failure(_CANNOT_COMPILE, error)
             if request == self._requests:  # else nobody wants it any more
-                self._ready, self._parts.refusal = prepared or self._ready, refusal
+                self._ready, self._parts.refusal = bundle or self._ready, refusal
                 self._prepared.trigger()
 
         self._parts.worker.call(job)
@@ -222,7 +222,7 @@ class SceneParserNode(Node):
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
 
-    def _compile_for(self, frame: DepthFrame, ready: Prepared) -> None:
+    def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:
         """Compile for images of a frame's size, where that is needed, and say so."""
         height, width = frame.depth.shape
         if not ready.parser.compiled_for(width, height):

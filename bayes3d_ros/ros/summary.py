@@ -4,7 +4,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
-from bayes3d_ros.ros.conversions import header
+from bayes3d_ros.ros.to_messages import header
 
 
 def key_values(**values: str) -> list[KeyValue]:

@@ -20,8 +20,9 @@ from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 from bayes3d_ros.ros.qos import LATCHED
+from bayes3d_ros.ros.to_messages import ns_to_stamp
 
 INTRINSICS = Intrinsics(100.0, 100.0, 31.5, 23.5, 64, 48)
 NAME = "/scene_parser: scene parsing"

@@ -23,8 +23,8 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.store import load_library, save_model
-from bayes3d_ros.ros.conversions import image_message, ns_to_stamp
 from bayes3d_ros.ros.processes import NodeProcess, free_domain
+from bayes3d_ros.ros.to_messages import image_message, ns_to_stamp
 
 HERE = Path(__file__).parent
 

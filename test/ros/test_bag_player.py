@@ -7,7 +7,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
 from bayes3d_ros.io.bags import BagWriter
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import from_messages
 from bayes3d_ros.ros.bag_player import main, message_class
 
 
@@ -64,10 +64,10 @@ def test_a_loop_publishes_what_was_recorded_again_and_again_with_the_clock(ros, 
     words = [str(bag), "--loop", "--clock", "--rate", "2", "--topics", "/depth/image_rect", "--wait", "60"]
     player = ros.start("-m", "bayes3d_ros.ros.bag_player", *words, *remap)
     ros.wait_for(lambda: len(images) >= 7 and clock, "two loops")
-    stamps = [conversions.stamp_to_ns(m.header.stamp) for m in images[:7]]
+    stamps = [from_messages.stamp_to_ns(m.header.stamp) for m in images[:7]]
     assert stamps == [10**9 + k % 3 * 10**7 for k in range(7)]
-    np.testing.assert_allclose(conversions.depth_from_image(images[0]), depth_frame().depth, atol=6e-4)
-    times = [conversions.stamp_to_ns(m.clock) for m in clock]
+    np.testing.assert_allclose(from_messages.depth_from_image(images[0]), depth_frame().depth, atol=6e-4)
+    times = [from_messages.stamp_to_ns(m.clock) for m in clock]
     assert min(times) >= 10**9 and max(times) <= 10**9 + 2 * 10**7
     assert player.stop() == 0, player.output()
 

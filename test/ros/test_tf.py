@@ -12,8 +12,9 @@ from geometry_msgs.msg import PoseArray, TransformStamped
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.ros.conversions import ns_to_stamp, stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 from bayes3d_ros.ros.qos import LATCHED
+from bayes3d_ros.ros.to_messages import ns_to_stamp
 
 pytest.importorskip("tf2_ros", reason="tf2_ros is not on PyPI")
 TFMessage: Any = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not on PyPI").TFMessage

@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
-from bayes3d_ros.ros import conversions, detections
+from bayes3d_ros.ros import detections, from_messages, to_messages
 from bayes3d_ros.ros.markers import SceneMarkers, principal_axes
 from bayes3d_ros.ros.summary import summary_message
 
@@ -21,7 +21,7 @@ def image(depth: np.ndarray, encoding: str, big: bool = False, padding: int = 0)
     step = depth.shape[1] * (2 if encoding == "16UC1" else 4) + padding
     message = Image(height=depth.shape[0], width=depth.shape[1], encoding=encoding, is_bigendian=big, step=step)
     message.data = array.array("B", encode_depth(depth, encoding, big, step))
-    message.header = Header(stamp=conversions.ns_to_stamp(1_700_000_000_123_456_789), frame_id="camera")
+    message.header = Header(stamp=to_messages.ns_to_stamp(1_700_000_000_123_456_789), frame_id="camera")
     return message
 
 
@@ -42,7 +42,7 @@ def depth_image() -> np.ndarray:
 @pytest.mark.parametrize("padding", [0, 4, 7])
 def test_depth_survives_encoding_byte_order_and_padding(encoding: str, big: bool, padding: int) -> None:
     depth = depth_image()
-    frame = conversions.frame_from_messages(image(depth, encoding, big, padding), camera_info(8, 6))
+    frame = from_messages.frame_from_messages(image(depth, encoding, big, padding), camera_info(8, 6))
     np.testing.assert_allclose(frame.depth, depth, atol=1e-6)
     assert frame.depth.dtype == np.float32
     assert (frame.stamp_ns, frame.frame_id) == (1_700_000_000_123_456_789, "camera")
@@ -50,7 +50,7 @@ def test_depth_survives_encoding_byte_order_and_padding(encoding: str, big: bool
 
 @pytest.mark.parametrize("ns", [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])
 def test_stamps_survive(ns: int) -> None:
-    assert conversions.stamp_to_ns(conversions.ns_to_stamp(ns)) == ns
+    assert from_messages.stamp_to_ns(to_messages.ns_to_stamp(ns)) == ns
 
 
 @pytest.mark.parametrize(
@@ -67,22 +67,22 @@ def test_a_wrong_image_is_refused_with_the_field_named(change: dict, named: str)
     for field, value in change.items():
         setattr(message, field, value)
     with pytest.raises(ValueError, match=named) as error:
-        conversions.frame_from_messages(message, camera_info(8, 6))
+        from_messages.frame_from_messages(message, camera_info(8, 6))
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("info", "named"), [(CameraInfo(width=8, height=6), r"K\[0\]"), (camera_info(4, 3), "8x6")])
 def test_a_wrong_camera_info_is_refused(info: CameraInfo, named: str) -> None:
     with pytest.raises(ValueError, match=named):
-        conversions.frame_from_messages(image(depth_image(), "16UC1"), info)
+        from_messages.frame_from_messages(image(depth_image(), "16UC1"), info)
 
 
 def test_an_image_message_decodes_to_its_pixels() -> None:
     depth = depth_image()
-    message = conversions.image_message(depth, "32FC1", Header(frame_id="camera"))
-    np.testing.assert_array_equal(conversions.depth_from_image(message), depth)
+    message = to_messages.image_message(depth, "32FC1", Header(frame_id="camera"))
+    np.testing.assert_array_equal(from_messages.depth_from_image(message), depth)
     labels = np.arange(48, dtype=np.uint16).reshape(6, 8)
-    message = conversions.image_message(labels, "16UC1", Header())
+    message = to_messages.image_message(labels, "16UC1", Header())
     np.testing.assert_array_equal(np.frombuffer(message.data, np.uint16).reshape(6, 8), labels)
     assert (message.step, message.height, message.width, message.is_bigendian) == (16, 6, 8, 0)
 
@@ -92,17 +92,17 @@ def test_poses_and_matrices_are_inverse() -> None:
     for _ in range(20):
         quaternion = rng.normal(size=4)
         quaternion /= np.linalg.norm(quaternion)
-        pose = conversions.pose_message(rng.normal(size=3), quaternion)
-        T = conversions.pose_to_matrix(pose)
-        again = conversions.matrix_to_pose(T)
-        np.testing.assert_allclose(conversions.pose_to_matrix(again), T, atol=1e-12)
+        pose = to_messages.pose_message(rng.normal(size=3), quaternion)
+        T = from_messages.pose_to_matrix(pose)
+        again = to_messages.matrix_to_pose(T)
+        np.testing.assert_allclose(from_messages.pose_to_matrix(again), T, atol=1e-12)
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
 
 @pytest.mark.parametrize("w", [0.0, 2.0, float("nan")])
 def test_a_pose_without_a_unit_quaternion_is_refused(w: float) -> None:
     with pytest.raises(ValueError, match="pose"):
-        conversions.pose_to_matrix(Pose(orientation=Quaternion(w=w)))
+        from_messages.pose_to_matrix(Pose(orientation=Quaternion(w=w)))
 
 
 def scene(names: tuple[str, ...]) -> ScenePosterior:
@@ -148,12 +148,12 @@ def scene(names: tuple[str, ...]) -> ScenePosterior:
 
 def test_the_posterior_cloud_holds_the_samples(library) -> None:
     posterior = scene(library.names)
-    cloud = conversions.posterior_cloud(posterior)
+    cloud = to_messages.posterior_cloud(posterior)
     names = "x y z qx qy qz qw log_weight p_outlier sigma sample n object type face"
     assert " ".join(f.name for f in cloud.fields) == names
     assert [f.datatype for f in cloud.fields] == [PointField.FLOAT32] * 10 + [PointField.INT32] * 5
     assert len(cloud.data) == cloud.row_step == cloud.point_step * cloud.width
-    rows = conversions.rows_from_cloud(cloud)
+    rows = from_messages.rows_from_cloud(cloud)
     assert rows.dtype == np.dtype(list(POSTERIOR_FIELDS))
     _, first = np.unique(rows["sample"], return_index=True)
     assert np.exp(rows["log_weight"][first]).sum() == pytest.approx(1, abs=1e-5)
@@ -163,15 +163,15 @@ def test_the_posterior_cloud_holds_the_samples(library) -> None:
         mine = rows[rows["object"] == k]
         assert {posterior.types[t] for t in mine["type"]} == {estimate.type}
         np.testing.assert_allclose(mine["x"].mean(), estimate.position[0], atol=2e-3)
-    assert (conversions.stamp_to_ns(cloud.header.stamp), cloud.header.frame_id) == (posterior.stamp_ns, "camera")
+    assert (from_messages.stamp_to_ns(cloud.header.stamp), cloud.header.frame_id) == (posterior.stamp_ns, "camera")
 
 
 def test_poses_are_in_the_order_of_labels(library) -> None:
     posterior = scene(library.names)
-    poses = conversions.pose_array(posterior)
+    poses = to_messages.pose_array(posterior)
     assert len(poses.poses) == len(posterior.objects) == 2
     for pose, estimate in zip(poses.poses, posterior.objects, strict=True):
-        np.testing.assert_allclose(conversions.pose_to_matrix(pose)[:3, 3], estimate.position)
+        np.testing.assert_allclose(from_messages.pose_to_matrix(pose)[:3, 3], estimate.position)
 
 
 def test_markers_delete_the_old_ones_first_and_are_unique(library) -> None:
@@ -189,7 +189,7 @@ def test_an_ellipsoid_has_the_covariance_it_was_made_from() -> None:
     A = np.random.default_rng(3).normal(size=(3, 3)) * 1e-2
     covariance = A @ A.T + 1e-6 * np.eye(3)
     quaternion, sigma = principal_axes(covariance)
-    R = conversions.matrix_from_values([0, 0, 0, *quaternion])[:3, :3]
+    R = from_messages.matrix_from_values([0, 0, 0, *quaternion])[:3, :3]
     np.testing.assert_allclose(R @ np.diag(sigma**2) @ R.T, covariance, atol=1e-12)
 
 
@@ -258,4 +258,4 @@ def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> N
 
 
 def test_the_library_message_lists_names() -> None:
-    assert conversions.library_message(("a", "b")).data == "a\nb"
+    assert to_messages.library_message(("a", "b")).data == "a\nb"

@@ -3,12 +3,11 @@
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import Image
 
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.summarise import object_estimates
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
-from bayes3d_ros.ros.conversions import depth_from_image, rows_from_cloud, stamp_to_ns
+from bayes3d_ros.ros.from_messages import depth_from_image, labels_from_image, rows_from_cloud, stamp_to_ns
 
 
 def stamp_of(message: Any) -> int:
@@ -37,11 +36,6 @@ def samples_from_rows(rows: np.ndarray) -> tuple[SceneSamples, np.ndarray]:
         num_objects=rows["n"][first], type=kind, face=face, position=position, orientation=orientation, **per_sample
     )
     return samples, index
-
-
-def labels_from_image(image: Image) -> np.ndarray:
-    """The labels of ~/segmentation."""
-    return np.frombuffer(image.data, "<u2").reshape(image.height, image.width)
 
 
 def posterior_from_messages(messages: dict[str, Any], library: Library) -> ScenePosterior:

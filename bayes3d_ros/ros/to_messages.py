@@ -1,4 +1,4 @@
-"""ROS messages to arrays and back. Nothing else in the package knows a message's fields."""
+"""Arrays and posteriors to ROS messages. from_messages.py is the other way."""
 
 import array
 from collections.abc import Mapping
@@ -8,70 +8,20 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Header, String
 
-from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
-from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.posterior.summarise import posterior_rows
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate
 
-_POINT_TYPE = {np.dtype(np.float32): PointField.FLOAT32, np.dtype(np.int32): PointField.INT32}
-
-
-def stamp_to_ns(stamp: Time) -> int:
-    """A stamp in nanoseconds."""
-    return stamp.sec * 10**9 + stamp.nanosec
+POINT_TYPES = {np.dtype(np.float32): PointField.FLOAT32, np.dtype(np.int32): PointField.INT32}
 
 
 def ns_to_stamp(ns: int) -> Time:
     """Nanoseconds as a stamp."""
     sec, nanosec = divmod(ns, 10**9)
     return Time(sec=sec, nanosec=nanosec)
-
-
-def depth_from_image(image: Image) -> Float[np.ndarray, "height width"]:
-    """Metres, NaN where there is no return. ValueError with one line naming the field that is wrong."""
-    return decode_depth(image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian))
-
-
-def intrinsics_from_message(info: CameraInfo, image: Image) -> Intrinsics:
-    """The intrinsics of an image. ValueError with one line naming the field that is wrong."""
-    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (image.width, image.height))
-
-
-def frame_from_messages(
-    image: Image, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
-) -> DepthFrame:
-    """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
-    try:
-        depth = depth_from_image(image)  # first: an image of a wrong size must not be blamed on its CameraInfo
-    except ValueError as error:
-        raise ValueError(f"Image {error}") from None
-    intrinsics = intrinsics_from_message(info, image)
-    return DepthFrame(depth, intrinsics, stamp_to_ns(image.header.stamp), image.header.frame_id, T_table_camera)
-
-
-def pose_to_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
-    """The transform of a pose. ValueError where it is not finite or its quaternion not of length one (within 1 %)."""
-    p, q = pose.position, pose.orientation
-    return matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
-
-
-def matrix_from_values(values: list[float]) -> Float[np.ndarray, "4 4"]:
-    """The transform of x y z qx qy qz qw, in metres. ValueError as pose_to_matrix."""
-    numbers = np.asarray(values, float)
-    if numbers.shape != (7,):
-        raise ValueError(f"pose: expected 7 numbers x y z qx qy qz qw, got {numbers.size}")
-    if not np.isfinite(numbers).all():
-        raise ValueError("pose: expected finite numbers, got NaN or infinity")
-    length = float(np.linalg.norm(numbers[3:]))
-    if abs(length - 1) > 0.01:
-        raise ValueError(f"pose orientation: expected a quaternion of length 1, got length {length:.3g}")
-    return pose_matrix(numbers[:3], numbers[3:])
 
 
 def pose_message(position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Pose:
@@ -151,27 +101,13 @@ def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:
     cloud = PointCloud2(header=cloud_header, height=1, width=len(rows), is_bigendian=False, is_dense=False)
     types: Mapping = rows.dtype.fields or {}
     cloud.fields = [
-        PointField(name=name, offset=offset, datatype=_POINT_TYPE[kind], count=1)
+        PointField(name=name, offset=offset, datatype=POINT_TYPES[kind], count=1)
         for name, (kind, offset, *_) in types.items()
     ]
     cloud.point_step = rows.dtype.itemsize
     cloud.row_step = cloud.point_step * len(rows)
     cloud.data = array.array("B", rows.tobytes())
     return cloud
-
-
-def rows_from_cloud(cloud: PointCloud2) -> np.ndarray:
-    """The structured array of a cloud of FLOAT32 and INT32 fields: the inverse of cloud_message."""
-    kinds = {value: key for key, value in _POINT_TYPE.items()}
-    row = np.dtype(
-        {
-            "names": [f.name for f in cloud.fields],
-            "formats": [kinds[f.datatype] for f in cloud.fields],
-            "offsets": [f.offset for f in cloud.fields],
-            "itemsize": cloud.point_step,
-        }
-    )
-    return np.frombuffer(cloud.data, row.newbyteorder(">" if cloud.is_bigendian else "<"))
 
 
 def library_message(names: tuple[str, ...]) -> String:

@@ -28,7 +28,7 @@ class Parser(Protocol):
 MakeParser = Callable[[Library, ParserSettings], Parser]
 
 
-class Prepared(NamedTuple):
+class ParserBundle(NamedTuple):
     """A compiled parser, markers for its library, and the name of JAX's backend."""
 
     parser: Parser
@@ -36,9 +36,11 @@ class Prepared(NamedTuple):
     backend: str
 
 
-def prepare(make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int]) -> Prepared:
+def make_bundle(
+    make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int]
+) -> ParserBundle:
     """Compile for images of a size (width, height; none if one is 0). Takes seconds to minutes."""
     parser = make_parser(library, settings)
     if all(size):
         parser.warm_up(*size)
-    return Prepared(parser, SceneMarkers(library), jax.default_backend())
+    return ParserBundle(parser, SceneMarkers(library), jax.default_backend())

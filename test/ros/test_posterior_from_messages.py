@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.posterior.summarise import posterior_rows
-from bayes3d_ros.ros import conversions
-from bayes3d_ros.ros.received import posterior_from_messages, samples_from_rows
+from bayes3d_ros.ros import to_messages
+from bayes3d_ros.ros.posterior_from_messages import posterior_from_messages, samples_from_rows
 from bayes3d_ros.ros.summary import summary_message
 
 
@@ -25,11 +25,11 @@ def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
 def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library) -> None:
     posterior = fake_posterior(depth_frame(12_345), library.names)
     messages = {
-        "posterior": conversions.posterior_cloud(posterior),
-        "poses": conversions.pose_array(posterior),
+        "posterior": to_messages.posterior_cloud(posterior),
+        "poses": to_messages.pose_array(posterior),
         "summary": summary_message(posterior),
-        "segmentation": conversions.segmentation_image(posterior),
-        "depth_reconstruction": conversions.reconstruction_image(posterior),
+        "segmentation": to_messages.segmentation_image(posterior),
+        "depth_reconstruction": to_messages.reconstruction_image(posterior),
     }
     again = posterior_from_messages(messages, library)
     assert (again.stamp_ns, again.frame_id, again.types) == (12_345, "camera", library.names)

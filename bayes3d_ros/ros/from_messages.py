@@ -1,0 +1,78 @@
+"""ROS messages to arrays. to_messages.py is the other way; nothing else in the package knows a message's fields."""
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose
+from jaxtyping import Float
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.poses import pose_matrix
+from bayes3d_ros.ros.to_messages import POINT_TYPES
+
+
+def stamp_to_ns(stamp: Time) -> int:
+    """A stamp in nanoseconds."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def depth_from_image(image: Image) -> Float[np.ndarray, "height width"]:
+    """Metres, NaN where there is no return. ValueError with one line naming the field that is wrong."""
+    return decode_depth(image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian))
+
+
+def intrinsics_from_message(info: CameraInfo, image: Image) -> Intrinsics:
+    """The intrinsics of an image. ValueError with one line naming the field that is wrong."""
+    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (image.width, image.height))
+
+
+def frame_from_messages(
+    image: Image, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
+) -> DepthFrame:
+    """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
+    try:
+        depth = depth_from_image(image)  # first: an image of a wrong size must not be blamed on its CameraInfo
+    except ValueError as error:
+        raise ValueError(f"Image {error}") from None
+    intrinsics = intrinsics_from_message(info, image)
+    return DepthFrame(depth, intrinsics, stamp_to_ns(image.header.stamp), image.header.frame_id, T_table_camera)
+
+
+def pose_to_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
+    """The transform of a pose. ValueError where it is not finite or its quaternion not of length one (within 1 %)."""
+    p, q = pose.position, pose.orientation
+    return matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+
+
+def matrix_from_values(values: list[float]) -> Float[np.ndarray, "4 4"]:
+    """The transform of x y z qx qy qz qw, in metres. ValueError as pose_to_matrix."""
+    numbers = np.asarray(values, float)
+    if numbers.shape != (7,):
+        raise ValueError(f"pose: expected 7 numbers x y z qx qy qz qw, got {numbers.size}")
+    if not np.isfinite(numbers).all():
+        raise ValueError("pose: expected finite numbers, got NaN or infinity")
+    length = float(np.linalg.norm(numbers[3:]))
+    if abs(length - 1) > 0.01:
+        raise ValueError(f"pose orientation: expected a quaternion of length 1, got length {length:.3g}")
+    return pose_matrix(numbers[:3], numbers[3:])
+
+
+def rows_from_cloud(cloud: PointCloud2) -> np.ndarray:
+    """The structured array of a cloud of FLOAT32 and INT32 fields: the inverse of to_messages.cloud_message."""
+    kinds = {value: key for key, value in POINT_TYPES.items()}
+    row = np.dtype(
+        {
+            "names": [f.name for f in cloud.fields],
+            "formats": [kinds[f.datatype] for f in cloud.fields],
+            "offsets": [f.offset for f in cloud.fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+    return np.frombuffer(cloud.data, row.newbyteorder(">" if cloud.is_bigendian else "<"))
+
+
+def labels_from_image(image: Image) -> np.ndarray:
+    """The labels of ~/segmentation."""
+    return np.frombuffer(image.data, "<u2").reshape(image.height, image.width)
