@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """All of the package's metadata; pyproject.toml only names the build backend and configures the tools."""
 
 from pathlib import Path

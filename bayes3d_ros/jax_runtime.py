@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where compiled code is kept between runs, and what it runs on."""
 
 import contextlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files that come with the package: bundled bags, parameters, profiles."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Settings of the algorithms: frozen dataclasses, from which ROS parameters and yaml files are derived."""
 
 from collections.abc import Collection

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start scene_parser, and optionally a bag and RViz.
 
     ros2 launch bayes3d_ros bayes3d.launch.py library:=/path/to/library depth:=/camera/depth/image_rect_raw \

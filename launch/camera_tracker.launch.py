@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start camera_tracker, and optionally a bag.
 
 ros2 launch bayes3d_ros camera_tracker.launch.py library:=/path/to/library

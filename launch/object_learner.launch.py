@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start object_learner, and optionally a bag.
 
 ros2 launch bayes3d_ros object_learner.launch.py library:=/path/to/library object_name:=mug

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What all tests share: one device, compiled code kept between sessions, array shapes checked as functions run."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What `bayes3d parse` and `bench` write, as shared by everything that reads it: keys, types, shapes, frames, stamps.
 
 One recording is parsed by the real parser, with one object in the library (settings as in ros/test_end_to_end.py, so

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Imports point one way, only ros/ knows ROS, and every import is declared."""
 
 import ast

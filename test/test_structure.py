@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rules of the source that keep a stranger from getting lost."""
 
 import ast

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d bench`: how fast this machine is."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d demo`: a bundled bag through real nodes."""
 
 from pathlib import Path

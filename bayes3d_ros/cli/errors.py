@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the `bayes3d` command makes of errors: one line on stderr and exit status 1 or 2."""
 
 import os

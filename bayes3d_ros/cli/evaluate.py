@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d evaluate`: how right the results are."""
 
 from pathlib import Path

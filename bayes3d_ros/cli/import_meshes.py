@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d import`: object models from meshes."""
 
 from pathlib import Path

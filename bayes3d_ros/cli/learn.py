@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d learn`: a model of an object from views of it."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Lines that commands print of what they work on and what came of it."""
 
 from typing import TYPE_CHECKING

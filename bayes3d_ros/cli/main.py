@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The `bayes3d` command. Exit status: 0, 1 (failed), 2 (bad usage or input: one line on stderr)."""
 
 import click

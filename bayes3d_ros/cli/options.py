@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Options that several commands share, and settings made of them."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d parse`: every depth frame of a bag into a posterior over scenes."""
 
 from pathlib import Path

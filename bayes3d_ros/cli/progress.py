@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a command says while it works: lines, a bar on a terminal, and the time that compiling takes."""
 
 import threading

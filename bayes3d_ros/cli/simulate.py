@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d simulate`: a depth bag of a simulated scene."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d track`: where the camera of a bag is, frame by frame."""
 
 from contextlib import nullcontext

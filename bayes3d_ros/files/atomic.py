@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files that are replaced whole or not at all: who reads one meanwhile, or after a kill, finds the old or the new."""
 
 import errno

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Arrays of .npz files that others may have written or damaged."""
 
 import zipfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files in yaml that people write."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pinhole intrinsics and depth images, in the camera optical frame (REP-103: x right, y down, z forward)."""
 
 from dataclasses import dataclass

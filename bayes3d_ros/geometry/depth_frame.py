@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One depth image, as the core sees it."""
 
 from dataclasses import dataclass

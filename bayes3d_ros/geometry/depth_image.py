@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth images as cameras send them (raw bytes, two encodings) to and from metres; no ROS, fields come as arguments.
 
 16UC1 (also called mono16 by some drivers) holds millimetres, 0 where there is no return; 32FC1 holds metres, where NaN,

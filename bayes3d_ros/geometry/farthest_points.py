@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Points spread evenly over a set: each the farthest from those before it."""
 
 from collections.abc import Callable

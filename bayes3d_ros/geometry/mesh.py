@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Triangle meshes: loading, surface samples, the minimum-volume box, and the facets an object can rest on."""
 
 import itertools

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rigid transforms as 4 x 4 matrices."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A robust loss, for numpy's arrays and JAX's alike."""
 
 from typing import Any

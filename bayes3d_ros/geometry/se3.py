@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rigid motions on the device: products, logarithms about a centre, and the measure that densities of them are over."""
 
 import jax.numpy as jnp

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Solids on voxel grids, with a plane in every surface voxel; meshes need not be watertight."""
 
 import itertools

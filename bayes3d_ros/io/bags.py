@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth frames from and to recorded bags (rosbag2 folders with MCAP storage, or bare .mcap files), without rclpy."""
 
 from collections.abc import Iterator

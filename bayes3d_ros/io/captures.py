@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth views on disk, one file each: what the object learner keeps until it is told to build."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The recorded messages of a bag, undecoded: rosbag2 folders with MCAP storage, or bare .mcap files.
 
 Files are read from the front, without their index, so that a bag whose recorder was killed still gives every message

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A learned model from four sides and from above."""
 
 from pathlib import Path

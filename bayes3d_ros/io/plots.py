@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pictures of a parsed frame."""
 
 from pathlib import Path

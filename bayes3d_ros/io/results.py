@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files of a parsed recording: scenes.jsonl, samples.npz and frames/STAMP_NS.npz (docs/outputs.md describes them)."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Files of a tracked recording: cameras.jsonl and track.png (docs/outputs.md describes them)."""
 
 import json

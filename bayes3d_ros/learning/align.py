@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Small errors of camera poses, corrected by aligning what every view shows of an object to what the others show.
 
 Height and tilt come from the table (`segment.py`), so three numbers are left a view: a shift along the table

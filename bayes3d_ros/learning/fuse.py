@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth views of one object, fused into a solid on a voxel grid.
 
 Every view votes on every voxel: for a surface where points fall into it, for free space where rays pass through to

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Learn a voxel model of an unknown object from a few calibrated depth views of it on the table."""
 
 from collections.abc import Sequence

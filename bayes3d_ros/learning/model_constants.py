@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Changes the model that is learned: constants beside the settings.
 
 Vote weights and the rule of refusal were chosen on the four objects of `bayes3d evaluate learning`; what the others

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What one calibrated depth view shows of things on the table: their surface points, in the table frame."""
 
 from typing import NamedTuple

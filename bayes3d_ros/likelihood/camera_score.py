@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
 
 from functools import partial

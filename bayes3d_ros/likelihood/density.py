@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Likelihoods of what a depth camera returned, given which pixels did (the mask is taken as given).
 
 `likelihoods` is the one table. Each row gives the density of inliers, and every pixel then has

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The kernel for a backend."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What kernels are given: hypotheses of what is rendered into which scenes."""
 
 from typing import NamedTuple

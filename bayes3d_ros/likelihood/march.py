@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fast renderer: walk each ray through the voxel grid, skipping empty space, to the first plane it meets.
 
 What is rendered (the reference renders the same): a surface voxel is hit where the ray, having entered its cube, meets

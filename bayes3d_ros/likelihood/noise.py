@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Noise variables are marginalised numerically: log likelihoods on a coarse grid, splines between, a fine sum.
 
 The log likelihood of a scene is smooth in (log sigma, logit p_outlier) but its peak is narrow: a coarse grid is enough

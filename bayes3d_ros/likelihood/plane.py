@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth of a plane, arithmetic only: on CPUs and in kernels alike."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The slow renderer that defines the right answer, float64: every ray against every voxel that it may enter."""
 
 from collections.abc import Iterator

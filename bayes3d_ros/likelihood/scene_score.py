@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change."""
 
 from functools import partial

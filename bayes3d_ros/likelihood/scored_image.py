@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The observed depth image at scoring resolution, and the parts of it that are scored together."""
 
 from typing import Any, NamedTuple

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hypotheses over several devices by JAX's own sharding: each scores its share of them. The cores of a CPU count as
 devices where JAX is told so (`jax_num_cpu_devices`): a loop over tiles runs on one core only."""
 

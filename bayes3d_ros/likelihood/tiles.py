@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The part of the image that each hypothesis can change, cut into tiles; depth rendered and scored tile by tile.
 
 Tiles of all hypotheses form one list, worked through in chunks of static shape, as many as it takes: cost grows with

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How far a ray may go through a voxel grid at once: the empty box ahead of a voxel, for each octant of directions."""
 
 import itertools

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The convex solid around all that rays can meet of an object: what its outline in an image is found by."""
 
 import itertools

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A library as padded arrays: what compiled code sees. Shapes depend on padded sizes only, so that a library can
 gain an object without a recompilation."""
 

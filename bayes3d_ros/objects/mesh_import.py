@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Object models made from meshes."""
 
 from collections.abc import Iterable, Iterator

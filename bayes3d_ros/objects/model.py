@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Voxel models of objects, and libraries of them. `store.py` keeps them in files."""
 
 import re

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The scene graph of Bayes3D (Methodology, i): a table, and objects that each touch it with one face of their box."""
 
 from typing import NamedTuple

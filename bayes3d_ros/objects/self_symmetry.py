@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Poses in which an object at rest looks like itself: half turns of a box, a mug upside down, any turn of a can.
 
 A search that found one of them need not find the others, and the posterior has to hold them all.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Libraries on disk: a folder of small versioned .npz files, one a model."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Pull coarse hypotheses onto the data: projective point-to-plane alignment of surface samples, along the three
 directions in which an object can slide and turn on the table."""
 

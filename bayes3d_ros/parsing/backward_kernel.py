@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Which object of a scene came last: the sampler's backward kernel over the orders of a set.
 
 L(last | scene) is in proportion to exp(-nats that an object alone gains over the empty table), with a floor: the search

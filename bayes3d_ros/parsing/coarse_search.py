@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The coarse level: score every (type, face, yaw, x, y) cell by a few samples of the object's surface.
 
 A sample is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The coarse level of the search (`coarse_search.py`) by loops that numba compiles, for CPUs."""
 
 from typing import NamedTuple

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth that neighbours agree on: where most returns are outliers, a few surface samples seldom meet a good one."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a whole parse is about."""
 
 from typing import NamedTuple

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metropolis-Hastings moves of one object of a scene, between the proposal and the target: a jump to where the object
 looks alike, a random walk, a fresh draw of the proposal."""
 

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fine levels: follow modes of the likelihood uphill, learn their shapes, and make a mixture that fits."""
 
 from collections.abc import Callable

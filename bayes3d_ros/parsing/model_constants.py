@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Changes the posterior: constants of the model, beside the settings, that a frame is parsed with.
 
 The likelihood's own stand in `likelihood/density.py`, those of smooth errors in `smooth_errors.py`.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Parse one depth frame into a posterior over scenes."""
 
 import contextlib

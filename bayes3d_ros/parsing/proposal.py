@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The proposal's density: a mixture of Student t components about the modes that the search found, and a floor.
 
 Components overlap where they will; the density of a proposed object is that of the whole mixture, summed over every

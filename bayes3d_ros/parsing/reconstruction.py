@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth and labels of a scene at the size of the camera's image, rendered by the model's own renderer.
 
 The rays of the pixels that an object may cover are walked through its voxels so many at a time: compiled once,

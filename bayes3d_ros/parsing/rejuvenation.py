@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Moves of objects that earlier stages placed, under the posterior of the whole scene.
 
 A population that is resampled stage by stage ends with few ancestors, and an object that was placed before its

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """From the whole space of one object to a proposal: cells scored by surface samples, the best of them aligned to the
 data, the best of those scored with the model itself and narrowed round by round."""
 

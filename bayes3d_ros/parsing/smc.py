@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Sequential Monte Carlo over the objects of a scene (Bayes3D, Methodology, B), with the paper's gaps closed.
 
 Stage k carries weighted scenes of k objects towards p_k, the posterior given k objects. The noise variables are

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Smooth depth errors, to first order: where the camera's picture of an object stands beside the object itself.
 
 Errors of real depth cameras are correlated over pixels: a bias of the whole image or of one object, waves over

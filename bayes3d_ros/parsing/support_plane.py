@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the table in a depth image, and tell which returns belong to the workspace."""
 
 from typing import NamedTuple

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Samples of an object's surface in the camera frame and in the image, and how they move with the object."""
 
 from typing import NamedTuple

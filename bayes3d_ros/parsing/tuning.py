@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the search and the sampler are tuned by: constants that change how much work finds the answer, and no posterior.
 
 Whatever the search finds, the sampler's weights are proper: with other values a frame takes more time, or more

@@ -1,1 +1,3 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a posterior over scenes is, and how samples are summarised."""

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Which objects of different scene samples are the same object."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Groups weighted poses into modes whose number is found, not given.
 
 A mode is a peak of the poses' density together with everything that flows up to it (topological mode analysis: Chazal

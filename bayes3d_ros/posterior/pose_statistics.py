@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Means and spreads of weighted poses that may have several modes."""
 
 from typing import NamedTuple

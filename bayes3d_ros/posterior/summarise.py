@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """From weighted scenes to what people and robots read: one scene, and how sure every part of it is."""
 
 from dataclasses import dataclass

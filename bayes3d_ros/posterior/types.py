@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The posterior over scenes: weighted samples, and the summaries that people and robots read."""
 
 from dataclasses import dataclass, field

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a node makes of its command line, beside what ROS does with it: usage, or one line of what is wrong."""
 
 import sys

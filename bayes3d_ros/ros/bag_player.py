@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """bag_player BAG: publish a recorded bag's messages as they were recorded, for machines without rosbag2."""
 
 import importlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where the camera stands: from the camera_pose topic, from tf, or from parameters, in that order."""
 
 import math

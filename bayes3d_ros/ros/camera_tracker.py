@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The camera_tracker node: depth images in, where the camera is in the world that it first saw out."""
 
 import contextlib

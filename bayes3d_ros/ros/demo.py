@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The main job, on a bundled bag, through real nodes: bag_player and scene_parser as processes over DDS."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A node's subscriptions to depth images, their CameraInfo and the camera's pose, joined into work for a parser."""
 
 import time

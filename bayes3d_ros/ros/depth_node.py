@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What scene_parser, object_learner and camera_tracker have in common: parameters, depth inputs, a report, a worker.
 
 A node holds one of these helpers and does not inherit from it: one of the three is a lifecycle node, the others not.

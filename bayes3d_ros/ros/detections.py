@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A scene as vision_msgs/Detection3DArray; vision_msgs is no part of common_interfaces and may not be installed."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a node tells of itself once a second: how fast it is, and why there is no output when there is none."""
 
 import math

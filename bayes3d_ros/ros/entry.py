@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The commands of the nodes. Ctrl-C ends them also in the seconds in which they import what they need."""
 
 import importlib

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """ROS messages to arrays. to_messages.py is the other way; nothing else in the package knows a message's fields."""
 
 import numpy as np

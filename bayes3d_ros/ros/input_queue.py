@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Images that wait for what belongs to them: the CameraInfo of their stamp, and the camera's pose.
 
 message_filters is not everywhere, and knows neither a fallback nor a deadline.

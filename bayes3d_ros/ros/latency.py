@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How long a frame takes through a real node: from the image's arrival to its poses', over DDS."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the launch files share: arguments, the node, a bag's player and RViz.
 
 Only the files in launch/ import this: `launch` comes with an installed ROS. Nothing heavy is imported, as the Python of

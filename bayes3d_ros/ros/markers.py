@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A scene as RViz shows it: voxels, names and uncertainties of its objects."""
 
 import colorsys

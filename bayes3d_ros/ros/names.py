@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Names of topics, and how ROS resolves them; without rclpy, as the launch files need them."""
 
 DEPTH_INPUT, INFO_INPUT, POSE_INPUT = "depth/image_rect", "depth/camera_info", "camera_pose"  # of all three nodes

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The object_learner node: captures views of an unknown object, and builds a model of it that scene_parser can use."""
 
 import sys

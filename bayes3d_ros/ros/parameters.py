@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """ROS parameters, their descriptors and the yaml files, all derived from the dataclasses of settings."""
 
 import difflib

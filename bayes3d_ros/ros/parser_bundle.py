@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A compiled parser, with what a node needs beside it."""
 
 from collections.abc import Callable

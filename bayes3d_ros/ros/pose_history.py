@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Camera poses from a topic, and the pose at the stamp of an image."""
 
 from bisect import bisect_left, insort

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A posterior put together again from the messages of one stamp: what a subscriber can know."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Nodes in processes of their own, on a ROS domain that nobody else on this machine uses."""
 
 import fcntl

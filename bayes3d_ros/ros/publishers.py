@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Everything the scene parser publishes of a scene."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The QoS profiles of everything that the nodes publish."""
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

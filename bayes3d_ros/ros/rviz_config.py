@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The RViz configuration of a scene_parser: config/bayes3d.rviz with the names that it really has."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The scene_parser node: depth images in, posteriors over scenes out."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Run a node until it is told to stop; every end is a clean one."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A subscription that finds the reliability, and where wanted the latched messages, of whoever publishes."""
 
 from collections.abc import Callable

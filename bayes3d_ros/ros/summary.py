@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A scene as people read it with `ros2 topic echo`: what stands where, how sure, and what the sampler did."""
 
 import numpy as np

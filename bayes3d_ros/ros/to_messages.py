@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Arrays and posteriors to ROS messages. from_messages.py is the other way."""
 
 import array

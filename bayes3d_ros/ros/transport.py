@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Shared memory that is large enough for images, for Fast DDS in this process."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """One thread that works on the newest frame only."""
 
 import threading

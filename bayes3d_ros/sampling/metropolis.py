@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The accept step of Metropolis-Hastings, of many chains at once."""
 
 from typing import Any, TypeVar

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Resampling of weighted particles."""
 
 from typing import TypeVar

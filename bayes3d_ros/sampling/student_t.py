@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Student t distributions in several dimensions."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tempered weights: exponents of a path q^(1-b) target^b, and how far log values have to be flattened, each found by
 bisection so that enough draws stay effective."""
 

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What smooth depth errors do to a camera's pose, to first order.
 
 As for objects (`smooth_errors.py`): errors of real depth cameras are alike over many pixels, the likelihood takes

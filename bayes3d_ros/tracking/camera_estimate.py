@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a camera is: what a tracked frame says."""
 
 from dataclasses import dataclass

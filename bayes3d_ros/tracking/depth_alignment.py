@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cameras moved until what they should see is what was seen: Gauss-Newton on the differences between observed and
 rendered depth, with slopes from images on either side."""
 

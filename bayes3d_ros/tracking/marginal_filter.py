@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a moving camera is in a known world, frame by frame: a particle filter over its pose, six degrees of freedom.
 
 State: weighted pairs of a pose and the motion that led to it. Motion keeps its velocity, T_t = Exp(e) D T_(t-1) with D

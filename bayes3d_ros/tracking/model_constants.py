@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Changes the posterior of a camera, or whether it counts as lost: constants beside the settings."""
 
 MOTION_FREEDOM = 5.0  # degrees of freedom, of the Student t by which motion changes between two frames

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a camera is in a known world of which one frame is all there is: draws of the paper's look-at prior, of which
 the best, from different sides, are aligned to the image.
 

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Start a camera's tracker, and find the camera again when it is lost."""
 
 from dataclasses import replace

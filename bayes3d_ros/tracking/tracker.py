@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Follow a camera through a known world, frame by frame."""
 
 import time

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What tracking is tuned by: constants that change how much work finds the camera, and not where it is.
 
 The filter's weights are proper whatever its search finds. Constants that change the posterior stand in

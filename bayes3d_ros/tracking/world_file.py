@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Objects whose poses are known beforehand, read from yaml."""
 
 from collections.abc import Sequence

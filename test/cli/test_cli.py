@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Exit codes, lines and files of the `bayes3d` command, with a stand-in for the parser."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A file is the old one or the new one, whole, and nothing else is left in its folder."""
 
 import json

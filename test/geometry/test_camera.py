@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cameras: projection and its inverse, and the cameras of resized images."""
 
 import numpy as np

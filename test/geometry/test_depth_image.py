@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth images: what is encoded is decoded, in every encoding, stride and byte order; every misfit has its own line."""
 
 import array

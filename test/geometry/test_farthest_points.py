@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Each point is the farthest from those before it."""
 
 import numpy as np

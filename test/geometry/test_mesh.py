@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Loading meshes, sampling them, their boxes and the facets they rest on."""
 
 import numpy as np

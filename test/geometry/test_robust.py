@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The robust loss in both libraries of arrays."""
 
 import jax.numpy as jnp

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Voxel solids against closed forms: volumes, cavities, and the depth of their planes along rays."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Bags: what is written is read; topics are found by the documented rules; whatever is broken is one clear line."""
 
 import io

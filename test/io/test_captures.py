@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Captures on disk: whole or not there, whatever happens to the process that writes them."""
 
 import random

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A picture is drawn whatever the posterior holds, without warnings."""
 
 import warnings

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the result files hold is what the posteriors say, and an interrupted run leaves whole lines."""
 
 import errno

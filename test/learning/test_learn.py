@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Models learned from simulated views (an independent renderer, sensor noise) against the meshes that were seen."""
 
 from dataclasses import replace

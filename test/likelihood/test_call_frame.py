@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where XLA's call frame is not as the compiled loops read it, XLA's own code does their work."""
 
 import logging

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Scores of camera poses, tile by tile, against the likelihood of whole images."""
 
 import jax

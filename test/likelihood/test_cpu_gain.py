@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The CPU's kernel, beyond what test_camera_score.py and test_scene_score.py compare with whole images."""
 
 import jax

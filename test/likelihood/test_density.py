@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The likelihood against the full sum in float64, and as a density of the depth image."""
 
 import jax

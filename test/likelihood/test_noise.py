@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Noise integrated out: against brute-force quadrature, on pixels drawn from a normal and outliers of density 1/2."""
 
 import jax

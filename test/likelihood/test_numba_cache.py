@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What numba has kept on disk is not used when any of the sources behind it has changed."""
 
 import ast

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Images in arrays with more rows than the camera has: the rows below say nothing, and nothing is rendered in them."""
 
 from types import SimpleNamespace

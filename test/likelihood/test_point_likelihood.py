@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's likelihood of free points: the full sum in float64, the density of points, and `depth` beside it."""
 
 from dataclasses import fields

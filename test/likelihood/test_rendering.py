@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The fast renderer against the slow one and against closed forms."""
 
 import copy

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Gains of hypotheses, tile by tile, against the likelihood of whole images."""
 
 import jax

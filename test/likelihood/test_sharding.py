@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Scores of hypotheses that several devices share are those of one device. Forced host devices: in a process of their
 own, as their number is fixed when JAX starts."""
 

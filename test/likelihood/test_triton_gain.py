@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The GPU's kernel where there is no GPU: it is lowered to Triton for one. What it computes is compared with the
 reference in test_camera_score.py and test_scene_score.py."""
 

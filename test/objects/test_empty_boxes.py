@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The empty boxes ahead of voxels, by exhaustion."""
 
 import numpy as np

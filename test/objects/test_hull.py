@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The solid around an object: it holds all that rays meet, and is no larger than that asks for."""
 
 import itertools

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Models made from meshes: frames, contact faces, and the import of files."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Placement poses, their prior, and the test of interpenetration."""
 
 import jax.numpy as jnp

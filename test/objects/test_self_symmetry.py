@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Poses in which an object looks alike: a box's half turns, a mug's mirror image, nothing for what has no symmetry."""
 
 import numpy as np

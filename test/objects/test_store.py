@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Model files and libraries: what is written is what is read, and bad files are named."""
 
 import dataclasses

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The coarse level's compiled loops against the same scores by whole arrays."""
 
 import jax

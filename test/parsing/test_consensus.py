@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The consensus of neighbours, which the search looks at where most returns are outliers."""
 
 import jax.numpy as jnp

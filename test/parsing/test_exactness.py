@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The sampler against exhaustive enumeration, and planted errors that the comparison must catch."""
 
 from functools import partial

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A second object may stand behind the first: its odds follow from the prior alone, and it may be anywhere there."""
 
 import jax

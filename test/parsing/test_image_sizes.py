@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Images of many sizes by one parser: compiled once, and the rows that arrays are filled up with change no result."""
 
 import logging

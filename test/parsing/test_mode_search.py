@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Modes that a search follows, and how draws are shared among them."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Whole frames: right answers on images of our own reference, reproducible, and compiled once."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A recorded frame, parsed with the paper's likelihood of free points."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The proposal's draws and its density agree, and the density is one."""
 
 import jax

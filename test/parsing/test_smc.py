@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The sampler's evidence against exhaustive enumeration, and its treatment of scenes as sets."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Offsets of objects against their pictures: what a smooth depth error does to first order."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The table found in point clouds, and what stands on it."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Laws of modes: weights, equivariance, order; closed forms for peaks, arcs and rings; few, equal and many samples."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Laws of the summaries: closed forms, invariance to the order of samples and slots, equivariance under rotations."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A camera on a robot as seen by a node: images at a rate, CameraInfo and poses with stamps and delays of their own.
 
 `python test/ros/camera_rig.py` prints a table of what scene_parser makes of each of many rigs, from a fresh node each

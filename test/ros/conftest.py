@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Nodes in processes of their own, over real DDS, on a domain that nobody else on this machine uses."""
 
 import os

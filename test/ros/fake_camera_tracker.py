@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The camera_tracker node around a tracker without a model: lost where the first return is nearer than half a metre."""
 
 import sys

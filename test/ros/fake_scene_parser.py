@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] [--compiling S] --ros-args
 ...`; seconds for every frame, and for the first one of every size."""
 

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`ros2 launch FILE NAME:=VALUE ...` without ros2cli: `run_launch.py FILE [NAME:=VALUE ...]`."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Long and hostile runs of a scene_parser process, too long for the suite.
 
 python test/ros/stress.py soak --library FOLDER [--minutes 10]    30 images a second of 640x480: memory, counts

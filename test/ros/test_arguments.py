@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A node's command line: usage, ROS arguments, and one line for anything else."""
 
 import sys

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """camera_tracker as a process of its own: poses in the world's frame at the image's stamp, silence while it is lost."""
 
 import time

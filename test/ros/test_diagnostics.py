@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What a node says of itself: why nothing comes in, why nothing goes out, and what floods no log."""
 
 import pytest

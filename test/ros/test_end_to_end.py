@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The real parser in its node: a bundled bag, over DDS, to the posterior."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Images wait for what belongs to them, the newest complete one is handed out, and nothing starves."""
 
 import heapq

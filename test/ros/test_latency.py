@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The node's row of `bayes3d bench`, with stand-ins for its processes: what it leaves behind."""
 
 import gc

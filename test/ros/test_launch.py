@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The launch files, run by the real `launch`, with a parser without a model."""
 
 import os

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 import array
 import dataclasses
 from types import SimpleNamespace

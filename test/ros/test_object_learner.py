@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """object_learner as a process of its own: capture, build, reset, refusals, and a kill in between."""
 
 import time

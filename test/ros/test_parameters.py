@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The camera's pose at the stamp of an image: exact, interpolated, nearest or static, never extrapolated."""
 
 import numpy as np

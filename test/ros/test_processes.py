@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Test sessions that run at the same time do not hear each other."""
 
 import subprocess

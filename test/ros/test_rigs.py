@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Cameras as they are wired on robots: CameraInfo, poses and tf that are late, rare, latched or elsewhere."""
 
 import signal

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """RViz gets the names that the node really has."""
 
 from collections.abc import Iterator

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """scene_parser and bag_player as processes of their own, around a parser without a model."""
 
 import signal

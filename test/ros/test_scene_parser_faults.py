@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What is wrong with the input is said in one line on /diagnostics, and the node goes on."""
 
 import array

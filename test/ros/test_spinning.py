@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Signals end a node without an exception, whenever they come."""
 
 import contextlib

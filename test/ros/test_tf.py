@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Camera poses from tf, with the real tf2_ros; it is not on PyPI, so these tests skip where no ROS is installed."""
 
 import time

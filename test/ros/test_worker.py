@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 import threading
 
 from bayes3d_ros.ros.worker import NewestWorker

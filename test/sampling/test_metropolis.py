@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Acceptance with probability min(1, ratio), and never of what has no weight."""
 
 import jax

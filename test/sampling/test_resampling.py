@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Laws of systematic resampling, and closed forms of the effective sample size."""
 
 import jax

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Draws and density of Student t distributions against scipy's."""
 
 import jax

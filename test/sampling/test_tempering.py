@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Tempered weights keep as many draws effective as was asked for."""
 
 import jax

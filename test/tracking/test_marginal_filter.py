@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The camera's particle filter: geometry and densities against closed forms, evidence against plain Monte Carlo, and a
 camera that is followed."""
 

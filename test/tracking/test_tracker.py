@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A camera followed through frames: found, lost, found again, and what is refused; its covariance."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Worlds that are known beforehand, from files."""
 
 from types import SimpleNamespace

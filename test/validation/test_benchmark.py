@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rows of the benchmark, with a stand-in for the parser; no time is asserted."""
 
 import json

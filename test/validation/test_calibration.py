@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The calibration experiment on a few scenes, and the errors that it must find."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Frames of a panning camera are of the poses that they are said to be, and the table tells what was tracked."""
 
 from types import SimpleNamespace

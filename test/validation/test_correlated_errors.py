@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Correlated depth errors against the settings that size them: variance, length, bounds, and none when off."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The coverage experiment's rows and summary from made-up posteriors of scenes whose truth is known."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Regions of made-up posteriors that are right cover at their nominal rate; of those too narrow or wide they do not."""
 
 import numpy as np

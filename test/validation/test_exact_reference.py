@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Enumeration: its cells tile the prior, its evidence converges, and pairs that stand apart factorise."""
 
 import jax.numpy as jnp

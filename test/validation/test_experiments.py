@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """`bayes3d evaluate` on a stand-in experiment, and what the parsing experiment says of made-up posteriors."""
 
 import json

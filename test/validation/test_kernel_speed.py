@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rows of the benchmark of rendering and scoring; no time is asserted. The others compute what we do."""
 
 import json

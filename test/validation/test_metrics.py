@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Metrics against closed forms."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The model run forwards agrees with the densities that score it."""
 
 from typing import NamedTuple

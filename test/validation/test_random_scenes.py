@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Random scenes: objects rest where they are said to, cameras see them, and depth agrees with MuJoCo and the truth."""
 
 from dataclasses import replace

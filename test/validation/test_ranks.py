@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Ranks and probabilities where right and wrong are known: a conjugate Gaussian, sampled well and badly."""
 
 import numpy as np

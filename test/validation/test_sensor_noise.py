@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Every effect of the depth camera against the parameter that sets it, and off at zero."""
 
 from dataclasses import replace

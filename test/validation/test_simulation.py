@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The simulator against analytic surfaces; its noise against its own parameters; the same seed gives the same bytes."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Growth of cost, from made-up rows."""
 
 import pytest

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the loops work in: the arrays that they are given, and those in which one hypothesis follows the other."""
 
 from typing import NamedTuple

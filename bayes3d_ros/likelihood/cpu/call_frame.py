@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether XLA's call frame has the layout that `xla_ffi.py` reads by fixed offsets.
 
 Every struct of XLA's C interface (`xla/ffi/api/c_api.h` in jax.ffi.include_dir()) begins with its size. A handler that

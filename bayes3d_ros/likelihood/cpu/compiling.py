@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How the loops are compiled by numba, and how its cache on disk is kept from being out of date.
 
 numba takes compiled code on disk for up to date as long as the function's own file has not changed. But compiled code

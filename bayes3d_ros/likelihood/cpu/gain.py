@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The loops of `handlers.py` as functions of JAX, for CPUs."""
 
 from collections.abc import Sequence

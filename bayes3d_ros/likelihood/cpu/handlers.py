@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hypotheses rendered and scored one after the other by loops that numba compiles, as XLA calls them on CPUs."""
 
 import numpy as np

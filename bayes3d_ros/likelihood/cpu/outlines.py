@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Where objects are in the image: the outline of the hull of all that rays can meet of an object."""
 
 import numpy as np

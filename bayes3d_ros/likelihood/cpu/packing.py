@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Vector instructions that LLVM does not find by itself: comparisons as bits, and the members of a set packed together.
 
 Measured: 0.9 ns a ray packed by permutations of whole vectors (AVX2), 2.7 one by one (docs/speed.md).

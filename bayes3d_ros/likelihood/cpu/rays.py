@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The walk of rays through voxel grids, many side by side.
 
 Rays of a hypothesis are `Lanes`: every loop over lanes is plain arithmetic, of which LLVM makes vector instructions,

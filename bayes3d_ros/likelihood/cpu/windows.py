@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The scores of pixels: which windows a hypothesis changes, and what their mixtures say.
 
 The densities are those of `likelihood/density.py`, written again in scalars; tests compare.

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """XLA's foreign functions written in numba: what a compiled function finds in the call frame that XLA hands it.
 
 The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()): structs are looked at as

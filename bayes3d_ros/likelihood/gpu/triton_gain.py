@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Hypotheses rendered and scored in one kernel (Pallas, Triton), for GPUs.
 
 A program takes one hypothesis after the other. It walks the rays of the pixels that the hypothesis can change, puts

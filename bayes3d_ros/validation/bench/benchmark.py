@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How fast this machine parses and starts, and what it is: rows of measurements, for people and as JSON."""
 
 import json

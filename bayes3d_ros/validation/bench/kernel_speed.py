@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How many hypotheses a second are rendered and scored, by us and by others, in one run.
 
 The workload: a mustard bottle stands before a level camera, 0.6 m away give or take 0.15 m to either side, near and

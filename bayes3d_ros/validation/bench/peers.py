@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What others do with the same hypotheses: ray casters on the CPU, and the likelihood in plain JAX."""
 
 import importlib.util

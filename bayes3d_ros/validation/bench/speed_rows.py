@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Rows of `bayes3d bench`, and what they say about how cost grows."""
 
 from collections.abc import Sequence

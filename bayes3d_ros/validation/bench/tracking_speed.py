@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How many frames a second the camera is tracked in: rows of `bayes3d bench`."""
 
 import tempfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiments: one module a result, one row of EXPERIMENTS each. `bayes3d evaluate NAME` runs them."""
 
 from collections.abc import Iterator, Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulation-based calibration of the sampler: scenes from the prior, images from the likelihood's own density, ranks
 of the truth among the samples. Every pixel returned, as the mask is taken as given."""
 

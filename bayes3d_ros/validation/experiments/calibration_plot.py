@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The picture of the calibration experiment: ranks of the truth, and what became of probabilities."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The calibration experiment with the paper's likelihood: as many free points as pixels, handed over as they are.
 
 sigma_max is so small that windows of 3 x 3 pixels hold the sums: 3 sigma f / z stays within 1.2 pixels.

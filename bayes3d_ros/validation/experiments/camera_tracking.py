@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The paper's Table of realtime camera tracking: a camera pans around one object, its first pose is given; how often a
 second, and how far off.
 

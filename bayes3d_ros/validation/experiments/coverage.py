@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether credible regions hold the truth on frames that no model of ours made: ray-cast meshes, correlated errors."""
 
 import tempfile

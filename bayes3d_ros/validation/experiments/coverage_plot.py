@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The picture of the coverage experiment: how often regions hold the truth, and how wide they are for their errors."""
 
 from collections.abc import Sequence

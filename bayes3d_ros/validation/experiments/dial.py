@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The user's dial: what more particles cost and what they buy, on the bundled frames."""
 
 import time

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The sampler against exhaustive enumeration: evidence, marginals and the number of objects on small problems."""
 
 import time

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The picture of the exactness experiment: enumerated and sampled marginals, and how far off the evidence is."""
 
 from collections.abc import Sequence

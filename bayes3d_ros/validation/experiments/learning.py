@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How good learned models are: their shape, and scenes parsed with learned models alone, for one to eight views."""
 
 import tempfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How right parsed frames are: every object of the bundled and the real recordings, how far off and how sure."""
 
 import tempfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The picture of the parsing experiment: error against visibility, true against stated error, every recording."""
 
 from collections.abc import Sequence

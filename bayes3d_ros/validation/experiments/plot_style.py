@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What the pictures of experiments have in common."""
 
 from typing import Literal

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Two runs of the sampler on the same frame: effective sizes of every stage, and whether the runs say the same."""
 
 import tempfile

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A problem small enough to be sampled a thousand times, and its posterior as one set of weighted scenes.
 
 Two types, up to two objects, an image of 64 x 48; the model, the search and the sampler are those of the parser.

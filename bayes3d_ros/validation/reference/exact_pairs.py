@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Posteriors of two objects that stand apart, by enumeration of each and a product of sums."""
 
 from collections.abc import Iterator

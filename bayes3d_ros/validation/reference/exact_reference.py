@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Posteriors of small problems by exhaustive enumeration: slow, simple, and free of the sampler's code.
 
 The space of one object (type, face, x, y, yaw) is tiled with cells. Each has the value of prior times likelihood at its

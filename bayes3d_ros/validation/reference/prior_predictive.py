@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """The model run forwards: scenes and noise from the prior, images or free points from the likelihood's own density."""
 
 from functools import partial

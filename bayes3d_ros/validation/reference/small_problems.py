@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Scenes small enough to be enumerated: a low-resolution noisy image of one or two simple solids on a small table."""
 
 from collections.abc import Callable

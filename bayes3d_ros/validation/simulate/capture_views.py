@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulated captures of one object for the learner, and what its model should have been."""
 
 from typing import NamedTuple

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Errors of depth that hang together over many pixels, as real cameras and real tables have them."""
 
 from typing import NamedTuple

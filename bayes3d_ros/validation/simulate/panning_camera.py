@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """A camera that pans around one object, and the depth frames it records: our own model's, without noise, or those of
 the mesh from the independent renderer, with a depth camera's noise."""
 

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Camera poses as a robot knows them: a little wrong."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Random tabletop scenes of one object, with correlated depth errors, to test what posteriors claim."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Perfect depth images of triangle meshes by MuJoCo ray casting; shares no code with the model's own renderers."""
 
 from collections.abc import Sequence

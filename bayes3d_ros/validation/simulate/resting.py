@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How rigid bodies come to rest on a table: on a facet of their convex hull above which the centre of mass lies."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Scenes to simulate, read from yaml; docs/simulation.md lists the keys. Unknown keys are errors."""
 
 from dataclasses import dataclass, fields

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What an active-stereo depth camera does to a perfect depth image; shares no code with the likelihoods."""
 
 from dataclasses import dataclass, fields

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Depth recordings of simulated scenes: MuJoCo ray casting of meshes, then a depth camera's noise, into a bag."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How far a sampled distribution is from an exact one, and how far it may be by chance."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Do intervals cover the truth: the smallest credible region of weighted samples that holds it, and how wide it is."""
 
 from collections.abc import Sequence

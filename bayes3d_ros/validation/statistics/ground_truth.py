@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """What stood where: the ground_truth.json beside a recording (docs/simulation.md), simulated or real."""
 
 import json

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """How far an estimated scene is from the truth: distances between poses, masks, and which object is which."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulation-based calibration (Talts et al. 2018): where the truth ranks among posterior samples, and whether ranks
 and probabilities are what they should be.
 

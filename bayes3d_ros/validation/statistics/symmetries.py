@@ -1,3 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+
 """Turns that a depth image cannot tell apart, of the YCB objects that stand in random scenes."""
 
 from typing import NamedTuple
