@@ -3,6 +3,7 @@
 """Rules of the source that keep a stranger from getting lost."""
 
 import ast
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,3 +54,13 @@ def test_functions_are_short_and_take_few_arguments(path: Path) -> None:
 def test_every_file_names_its_licence(folder: str) -> None:
     lacking = [path for path in (REPOSITORY / folder).rglob("*.py") if path.read_text().split("\n")[0] != LICENCE]
     assert lacking == []
+
+
+def test_files_that_texts_name_exist() -> None:
+    """Whole paths are from the package or the repository; a bare name is a file somewhere in them."""
+    sources = [path for folder in (PACKAGE, REPOSITORY / "test") for path in folder.rglob("*.py")]
+    names = {path.name for path in (*sources, *(REPOSITORY / "launch").glob("*.py"), REPOSITORY / "setup.py")}
+    for text in (*sources, *REPOSITORY.glob("docs/*.md"), REPOSITORY / "README.md", REPOSITORY / "bags" / "README.md"):
+        for name in re.findall(r"`([\w./]+\.py)", text.read_text()):
+            found = name in names or any((folder / name).exists() for folder in (PACKAGE, REPOSITORY, text.parent))
+            assert found, f"{text}: there is no {name}"
