@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 SMALLEST, LARGEST = 0.005, 2.0  # metres, along the longest side: beyond these a mesh is not in metres
-LARGE = 1.0  # metres: a tabletop object may be as long as this, but a small one in centimetres may seem to be
+LARGE_LENGTH = 1.0  # metres: a tabletop object may be as long as this, but a small one in centimetres may seem to be
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "kilometres": 1000.0}  # of one, in metres
 
 
@@ -79,7 +79,7 @@ def size_problem(mesh: trimesh.Trimesh) -> str | None:
     longest = float(mesh.extents.max())
     if SMALLEST <= longest <= LARGEST:
         return None
-    likely = [f"{s:g} if it is in {unit}" for unit, s in _UNITS.items() if 2 * SMALLEST <= s * longest <= LARGE]
+    likely = [f"{s:g} if it is in {unit}" for unit, s in _UNITS.items() if 2 * SMALLEST <= s * longest <= LARGE_LENGTH]
     remedy = (
         f"meshes are read in metres; --scale {', '.join(likely)}" if likely else "--scale makes metres of its units"
     )
@@ -89,7 +89,7 @@ def size_problem(mesh: trimesh.Trimesh) -> str | None:
 
 def size_warning(mesh: trimesh.Trimesh) -> str | None:
     """One line where a tabletop object may have this size, but few do; else None."""
-    if mesh.extents.max() <= LARGE:
+    if mesh.extents.max() <= LARGE_LENGTH:
         return None
     return (
         f"the mesh measures {_metres(mesh.extents)}, which is large for a tabletop object: is it in metres (--scale)?"

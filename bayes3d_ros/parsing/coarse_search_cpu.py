@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, handler
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
-_TARGET = "bayes3d_cell_scores"  # to XLA
+_CELL_SCORES = "bayes3d_cell_scores"  # to XLA
 _ORIENTATIONS_AT_ONCE = 8  # their points stay in the first-level cache, and are a multiple of a vector
 _NEAREST_M, _FARTHEST_M = 0.02, 1e6  # metres
 
@@ -43,7 +43,7 @@ def cell_scores(
         jnp.stack([*jnp.int32([*depth.shape, *point.shape[1:]]), count, num_types]).astype(jnp.int32),
     )
     result = jax.ShapeDtypeStruct((moved.shape[0], *point.shape[1:3]), jnp.float32)
-    return jax.ffi.ffi_call(_TARGET, result, vmap_method="sequential")(*inputs)
+    return jax.ffi.ffi_call(_CELL_SCORES, result, vmap_method="sequential")(*inputs)
 
 
 class _Image(NamedTuple):
@@ -178,4 +178,4 @@ def _cell_scores(frame):
     return 0
 
 
-register(_TARGET, _cell_scores)
+register(_CELL_SCORES, _cell_scores)

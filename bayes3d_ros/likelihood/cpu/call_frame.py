@@ -40,7 +40,7 @@ class Layout(NamedTuple):
 # Versions 0.1 to 0.5; the last is that of jaxlib 0.12.
 EXPECTED = Layout(call_frame=168, arguments=40, results=40, api_version=24, major=VERSION[0], buffer=48)
 
-_TARGET = "bayes3d_call_frame"  # to XLA
+_CALL_FRAME = "bayes3d_call_frame"  # to XLA
 _one_at_a_time = threading.Lock()
 _handlers: list[object] = []  # XLA keeps their addresses
 
@@ -85,8 +85,8 @@ def reported() -> dict[str, int | str]:
     _handlers.append(handler)
     try:
         capsule = jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p))
-        jax.ffi.register_ffi_target(_TARGET, capsule, platform="cpu")
-        call = jax.jit(jax.ffi.ffi_call(_TARGET, jax.ShapeDtypeStruct((1,), jnp.float32)))
+        jax.ffi.register_ffi_target(_CALL_FRAME, capsule, platform="cpu")
+        call = jax.jit(jax.ffi.ffi_call(_CALL_FRAME, jax.ShapeDtypeStruct((1,), jnp.float32)))
         # JAX may be tracing in this thread, where the call would become a part of what is traced.
         with ThreadPoolExecutor(1) as thread:
             thread.submit(lambda: jax.block_until_ready(call(np.zeros(1, np.float32)))).result()
