@@ -161,6 +161,8 @@ def point_density(
 
 
 def outlier_density(pixels: Pixels) -> Float[Array, "..."]:
+    """Depth uniform in the frustum's volume. The loops for CPUs have the same formula (`cpu/windows.py`, and its limits
+    in `cpu/gain.py`); `test_scene_score.py` compares them with this one."""
     return pixels.outlier_scale * pixels.depth**2
 
 

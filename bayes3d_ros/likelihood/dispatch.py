@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The kernel for a backend."""
+"""Which renderer hypotheses are scored by: a kernel that renders and scores at once, chosen by backend and by what the
+image holds; where there is none, `march.py` renders and `tiles.py` scores."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable

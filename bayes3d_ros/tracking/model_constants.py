@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Changes the posterior of a camera, or whether it counts as lost: constants beside the settings."""
+"""Changes the posterior of a camera, or whether it counts as lost: constants beside the settings (`least_explained`).
+The rule that tells a lost camera is `_why_lost` in `tracker.py`."""
 
 MOTION_FREEDOM = 5.0  # degrees of freedom, of the Student t by which motion changes between two frames
 
