@@ -66,8 +66,8 @@ def run(problem: SmallProblem, seed: int, particles: int = RUN_PARTICLES, step: 
         log_evidence.append(float(state.log_evidence))
     weight = np.exp(np.asarray(state.log_weight, np.float64))
     placement: Placement = jax.tree.map(lambda a: np.asarray(a)[:, :objects], state.objects)
-    line = np.asarray(state.line)
-    ess = min(effective_size(weight, [line[:, k]]) for k in range(objects))
+    lineage = np.asarray(state.lineage)
+    ess = min(effective_size(weight, [lineage[:, k]]) for k in range(objects))
     return Run(tuple(log_evidence), placement, weight / weight.sum(), ess)
 
 
