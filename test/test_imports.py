@@ -12,18 +12,16 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+from fixtures.sources import FILES, PACKAGE, REPOSITORY, identity
 
 import bayes3d_ros
 
-PACKAGE = Path(bayes3d_ros.__file__).parent
-REPOSITORY = Path(__file__).resolve().parents[1]
 # A room may import those before it. `validation` is for the commands that measure; the nodes run without it.
 ROOMS = (
     *("resources", "jax_runtime", "settings", "files", "geometry", "objects", "likelihood", "sampling", "posterior"),
     *("parsing", "tracking", "learning", "io", "ros", "validation", "cli"),
 )
 MEASURED_THROUGH_NODES = {"ros/latency.py", "ros/demo.py"}  # they may import validation, and only commands import them
-FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {
     *("rclpy", "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "std_msgs", "std_srvs", "geometry_msgs"),
     *("sensor_msgs", "visualization_msgs", "diagnostic_msgs", "nav_msgs", "rosgraph_msgs", "tf2_ros", "vision_msgs"),
@@ -57,10 +55,6 @@ def home(path: Path) -> str:
     """The room of a file, or its stem if it stands beside the rooms."""
     relative = path.relative_to(PACKAGE)
     return relative.parts[0] if len(relative.parts) > 1 else relative.stem
-
-
-def identity(path: Path) -> str:
-    return str(path.relative_to(PACKAGE))
 
 
 @pytest.mark.parametrize("path", FILES, ids=identity)

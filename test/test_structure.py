@@ -9,19 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fixtures.sources import FILES, PACKAGE, REPOSITORY, identity
 
-import bayes3d_ros
-
-PACKAGE = Path(bayes3d_ros.__file__).parent
-REPOSITORY = Path(__file__).resolve().parents[1]
-FILES = sorted(PACKAGE.rglob("*.py"))
 KERNELS = {"likelihood/cpu", "likelihood/gpu", "parsing/coarse_search_cpu.py"}
 LONGEST_FUNCTION, MOST_ARGUMENTS = 60, 8
 LICENCE = "# SPDX-License-Identifier: Apache-2.0"
-
-
-def identity(path: Path) -> str:
-    return str(path.relative_to(PACKAGE))
 
 
 def definitions(path: Path, kind: type[ast.AST]) -> Iterator[ast.AST]:

@@ -11,8 +11,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def write_whole(path: Path, write: Callable[[BinaryIO], Any], *, mode: int | None = None, replace: bool = True) -> None:
-    """Let `write` fill a temporary file, give it the name `path`, and return when both are on the disk.
+def write_whole(
+    path: Path,
+    write: Callable[[BinaryIO], Any],
+    *,
+    mode: int | None = None,
+    replace: bool = True,
+    durable: bool = False,
+) -> None:
+    """Let `write` fill a temporary file, and give it the name `path`; if `durable`, return when both are on the disk.
 
     The temporary file is `.NAME-*.tmp` in the same folder. It goes away if `write` fails, and stays only if the process
     is killed (`remove_leftovers`). `mode` is that of the file; by default what the umask leaves. Raises OSError; unless
@@ -29,12 +36,14 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], *, mode: int | Non
             file.flush()
             if mode is not None:
                 os.fchmod(handle, mode)
-            os.fsync(handle)
+            if durable:
+                os.fsync(handle)
         if replace:
             os.replace(temporary, path)
         else:
             _move_to_new(temporary, path)
-        _sync_folder(path.parent)
+        if durable:
+            _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 

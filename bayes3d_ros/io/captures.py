@@ -42,7 +42,7 @@ class CaptureStore:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             # As it is: compressing took several times as long as the disk.
-            write_whole(path, lambda file: np.savez(file, **arrays), mode=0o600)
+            write_whole(path, lambda file: np.savez(file, **arrays), mode=0o600, durable=True)
         except OSError as error:
             raise CaptureError(f"{path}: cannot write the capture: {error.strerror or error}") from None
         return path

@@ -51,7 +51,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path,
 def test_file_and_folder_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[str] = []
     monkeypatch.setattr("os.fsync", lambda handle: synced.append(os.readlink(f"/proc/self/fd/{handle}")))
-    write_whole(tmp_path / "file", new)
+    write_whole(tmp_path / "file", new, durable=True)
     written, folder = synced
     assert Path(written).name.startswith(".file-") and folder == str(tmp_path)
 
