@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""From a depth frame to the image that is scored: the table in it, and which returns belong to the workspace."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayes3d_ros.geometry.camera import Intrinsics, unproject
+from bayes3d_ros.geometry.depth_frame import DepthFrame, reduced, scored_size
+from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
+from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
+from bayes3d_ros.objects.placement import Table
+from bayes3d_ros.parsing.support_plane import find_plane, table_depth, table_frame, usable_share, workspace
+from bayes3d_ros.posterior.types import FEWEST_USABLE, ParseError, usable_note
+from bayes3d_ros.settings import ParserSettings
+
+
+class Observation(NamedTuple):
+    """What the model is given of a frame."""
+
+    image: ScoredImage
+    table: Table
+    T_camera_table: Float[np.ndarray, "4 4"]
+    usable_share: float  # of the scored pixels on the table (`support_plane.py`)
+    notes: list[str]  # worst first
+
+
+def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
+    """Reduce a frame to the image that is scored, and find the table in it. Raises ParseError where nothing returned in
+    range, or no table is in sight."""
+    camera, depth, in_range, returned = reduced(frame, settings.score_width, settings.near, settings.far)
+    if not in_range.any():
+        raise ParseError(
+            f"the depth image has no return between {settings.near} and {settings.far} m "
+            f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
+        )
+    points = unproject(np.where(returned, depth, np.nan), camera)
+    T_camera_table, notes = _find_table(frame, points[returned], settings.table)
+    table_size = (settings.table_width, settings.table_depth)
+    pixel_class = workspace(points, T_camera_table, table_size, settings.workspace_height)
+    image, table = _as_scored(camera, np.where(returned, depth, 0.0), pixel_class, T_camera_table, settings)
+    usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
+    notes = [usable_note(usable)] * (usable < FEWEST_USABLE) + notes
+    return Observation(image, table, T_camera_table, usable, notes)
+
+
+def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, Table]:
+    """A made-up image of a bare table, as a camera 0.8 m above it sees it whose images have this size. Scoring it
+    compiles all that a frame needs, and takes no search."""
+    across, down = scored_size(width, height, settings.score_width)
+    camera = Intrinsics(float(across), float(across), (across - 1) / 2, (down - 1) / 2, across, down)
+    above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
+    T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
+    depth = above / np.maximum(camera.rays()[..., 1] * c + s, 0.2)
+    pixel_class = np.full(depth.shape, IN_WORKSPACE)
+    return _as_scored(camera, depth, pixel_class, np.linalg.inv(T_table_camera), settings)
+
+
+def _find_table(
+    frame: DepthFrame, points: Float[np.ndarray, "N 3"], source: str
+) -> tuple[Float[np.ndarray, "4 4"], list[str]]:
+    """T_camera_table, and what to say of where it comes from; source: the setting `table`."""
+    if source != "depth" and frame.T_table_camera is not None:
+        return np.linalg.inv(frame.T_table_camera), []
+    if source == "pose":
+        raise ParseError("no camera pose for this frame, and table:=pose expects one")
+    return table_frame(find_plane(points), points), ["table found in the depth image"]
+
+
+def _as_scored(
+    camera: Intrinsics,
+    depth: Float[np.ndarray, "height width"],
+    pixel_class: Int[np.ndarray, "height width"],
+    T_camera_table: Float[np.ndarray, "4 4"],
+    settings: ParserSettings,
+) -> tuple[ScoredImage, Table]:
+    """The image and the table in it for JAX, from depth in metres, 0 where there is no return."""
+    bare = np.where(pixel_class != BEYOND, table_depth(camera.rays(), T_camera_table, settings.far), np.inf)
+    likelihood, weight = Likelihood(settings.likelihood), np.float32(settings.pixel_weight)
+    near, far, sigma_max = settings.near, settings.far, settings.sigma_max
+    image = scored_image(camera, depth, pixel_class, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)
+    size = jnp.array((settings.table_width, settings.table_depth), jnp.float32)
+    return jax.device_put(image), Table(jnp.asarray(T_camera_table, jnp.float32), size)
