@@ -32,9 +32,9 @@ class Stage(NamedTuple):
     @classmethod
     def without_scenes(cls, log_evidence: float, slots: int) -> "Stage":
         """A stage whose scenes do not matter: only its evidence."""
-        none, nothing = np.zeros((0, slots), np.int32), np.zeros((0, slots), np.float32)
+        kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
+        objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        objects = Placement(none, none, nothing, nothing, nothing)
         offset, plane = np.zeros((0, slots, 3), np.float32), np.zeros((0, 3), np.float32)
         return cls(objects, offset, plane, zero, zero, zero, log_evidence)
 
