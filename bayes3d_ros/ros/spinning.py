@@ -11,13 +11,13 @@ from typing import NoReturn, Protocol, cast
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from bayes3d_ros.ros.transport import use_large_messages
 
 _PATIENCE = 0.3  # seconds that a frame may still take when a node is told to stop
-_AGAIN = 0.5  # seconds after which an interrupt that had no effect is raised again
+_AGAIN = 0.5  # seconds after which an interrupt that had no effect is raised, or raised again
 
 
 class StoppableNode(Protocol):
@@ -35,14 +35,17 @@ def run_node(make_node: Callable[[], StoppableNode], args: list[str] | None = No
     The process ends as soon as the node is gone and its DDS participant has said goodbye. To take the interpreter and
     JAX apart would take seconds more, and a compilation or a long frame on the worker's thread cannot be interrupted.
     """
-    node = None
+    node, executor = None, None
     try:
         with until_stopped():
             use_large_messages()
             rclpy.init(args=args)
+            executor = SingleThreadedExecutor()
             node = make_node()
-            rclpy.spin(cast(Node, node))
+            rclpy.spin(cast(Node, node), executor)
     finally:
+        if executor is not None:
+            executor.shutdown()  # where a callback failed, the executor still uses what it waited for
         if node is not None:
             node.stop(timeout=_PATIENCE)
             cast(Node, node).destroy_node()
@@ -57,15 +60,21 @@ def until_stopped() -> Iterator[None]:
     """Work that SIGINT, SIGTERM or a shutdown of ROS ends, without an exception. SIGINT is ignored from then on: launch
     and a terminal both send one for the same Ctrl-C, and the second must not cut the clean end short.
 
-    An exception is lost where Python has nobody to hand it to, as in JAX's callback of the garbage collector; so it is
-    raised again until the work has ended."""
+    Where ROS runs, a signal shuts ROS down, and work ends between two callbacks. An exception out of a signal could
+    come between any two instructions of rclpy, which then counts an entity as in use for ever: the DDS participant
+    stays, and so does its shared memory. The exception is therefore raised at once only before ROS runs, and later
+    only while the work has not ended. It is raised again and again, because Python drops an exception where nobody can
+    catch it, as in JAX's callback of the garbage collector."""
     ended = False
 
     def interrupt(number: int, frame: object) -> None:
         nonlocal ended
-        if not ended:
-            ended = True
+        if ended:
+            return
+        ended = True
+        if rclpy.get_default_context().handle is None:  # `ok` takes a lock, which the interrupted code may hold
             again(number, frame)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
 
     def again(number: int, frame: object) -> None:
         signal.setitimer(signal.ITIMER_REAL, _AGAIN)
@@ -78,8 +87,7 @@ def until_stopped() -> Iterator[None]:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # A signal between two calls of rclpy leaves the second one without a context; one while a message is taken
-        # comes out as another exception.
+        # A signal between two calls of rclpy leaves the second one without a context.
         if rclpy.ok() and not ended:
             raise
     finally:

@@ -6,11 +6,14 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from rclpy.executors import ExternalShutdownException
 
 from bayes3d_ros.ros import spinning
+
+HERE = Path(__file__).parent
 
 
 @pytest.fixture(autouse=True)
@@ -76,3 +79,11 @@ def test_ctrl_c_while_a_node_imports_ends_it(ros) -> None:
     ros.wait_for(lambda: "began" in process.output(), "the beginning")
     assert process.stop(signal.SIGINT) == 0
     assert process.output() == "began\n"
+
+
+def test_a_signal_in_the_middle_of_rclpy_leaves_no_shared_memory(ros) -> None:
+    process = ros.start(str(HERE / "interrupted_node.py"))
+    ros.wait_for(lambda: process.status is not None, "the end")
+    assert process.status == 0
+    held = [Path(line) for line in process.output().splitlines()]
+    assert held and not [path for path in held if path.exists()]
