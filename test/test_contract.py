@@ -25,11 +25,11 @@ BAG = share_directory() / "bags" / "one_object"
 SIZE = (640, 480)
 SCENE_KEYS = {
     *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects"),
-    *("T_camera_table", "ess", "usable_share", "notes"),
+    *("T_camera_table", "ess", "usable_share", "unexplained", "notes"),
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
-    *("face_probabilities", "modes"),
+    *("face_probabilities", "modes", "explained"),
 }
 MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
 FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma")
@@ -71,7 +71,7 @@ def test_a_line_a_frame_in_the_images_stamp_and_frame(scenes: list[dict]) -> Non
         assert set(scene["noise"]) == {"p_outlier", "sigma"}
         assert 0 < scene["noise"]["p_outlier"] < 1 and 0 < scene["noise"]["sigma"] < 0.01
         assert np.shape(scene["T_camera_table"]) == (4, 4)
-        assert 0.9 < scene["usable_share"] <= 1 and scene["notes"] == []
+        assert 0.9 < scene["usable_share"] <= 1 and scene["notes"] == [] and scene["unexplained"] == []
 
 
 def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:

@@ -28,12 +28,9 @@ def frame_line(posterior: "ScenePosterior") -> str:
 
 
 def note_lines(posterior: "ScenePosterior", before: tuple[str, ...]) -> list[str]:
-    """The notes of a frame, without those that the frame before had as well; that too few pixels can be used is said of
-    every frame, beside its p(n)."""
-    from bayes3d_ros.posterior.types import usable_note
-
-    again = usable_note(posterior.usable_share) if posterior.too_little_usable else None
-    return [f"{posterior.stamp_ns}  note: {note}" for note in posterior.notes if note not in before or note == again]
+    """The notes of a frame, without those that the frame before had as well; warnings are said of every frame."""
+    again = posterior.warnings
+    return [f"{posterior.stamp_ns}  note: {note}" for note in posterior.notes if note not in before or note in again]
 
 
 def camera_line(estimate: "CameraEstimate") -> str:

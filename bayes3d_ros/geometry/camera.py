@@ -5,7 +5,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Intrinsics:
         )
 
     def subsampled(self, width: int, height: int) -> "Intrinsics":
-        """The camera of the pixels that `resize_depth` picks. Where a picked pixel has no middle one to stand for (an
+        """The camera of the pixels that `resize_nearest` picks. Where a picked pixel has no middle one to stand for (an
         even factor), it lies half a source pixel beside the middle of its area: `resized` would put every ray there."""
         rows, columns = _nearest((self.height, self.width), width, height)
         sx, sy = width / self.width, height / self.height
@@ -73,12 +73,13 @@ def nearest_pixels(
     return u, v, z, (z > 0) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
 
 
-def resize_depth(
-    depth: Float[np.ndarray, "height width"], width: int, height: int
-) -> Float[np.ndarray, "new_height new_width"]:
-    """Nearest-neighbour resize: a minimum or a mean would bias depth, and no value is invented at edges."""
-    v, u = _nearest(depth.shape, width, height)
-    return depth[v[:, None], u]
+def resize_nearest(
+    image: Shaped[np.ndarray, "height width"], width: int, height: int
+) -> Shaped[np.ndarray, "new_height new_width"]:
+    """Nearest-neighbour resize, of depth or labels: a minimum or a mean would bias depth, and no value is invented at
+    edges."""
+    v, u = _nearest(image.shape, width, height)
+    return image[v[:, None], u]
 
 
 def _nearest(shape: tuple[int, int], width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +93,7 @@ def _nearest(shape: tuple[int, int], width: int, height: int) -> tuple[np.ndarra
 def trustworthy(
     depth: Float[np.ndarray, "height width"], width: int, height: int, spread: float = 0.03
 ) -> Bool[np.ndarray, "new_height new_width"]:
-    """Which pixels of `resize_depth` stand among returns that agree with them.
+    """Which pixels of `resize_nearest` stand among returns that agree with them.
 
     Depth cameras invent values along the edges of things (mixed pixels) and of holes. A pixel is kept if four fifths of
     its neighbours in the full image returned, none of them more than `spread` (a share of the depth) nearer or farther.

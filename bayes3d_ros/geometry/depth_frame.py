@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bayes3d_ros.geometry.camera import Intrinsics, resize_depth, trustworthy
+from bayes3d_ros.geometry.camera import Intrinsics, resize_nearest, trustworthy
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def scored_size(width: int, height: int, score_width: int) -> tuple[int, int]:
 def reduced(frame: DepthFrame, score_width: int, near: float, far: float) -> Reduced:
     """The frame at the size at which it is scored; `near` and `far` in metres."""
     width, height = scored_size(frame.intrinsics.width, frame.intrinsics.height, score_width)
-    depth = resize_depth(frame.depth, width, height)
+    depth = resize_nearest(frame.depth, width, height)
     with np.errstate(invalid="ignore"):
         returned = np.isfinite(depth) & (depth >= near) & (depth <= far)
     trusted = returned & trustworthy(frame.depth, width, height)

@@ -24,6 +24,7 @@ COLOURS = (
 )  # fmt: skip
 NO_RETURN_COLOUR, OTHER_COLOUR, INK = "#d8d8d8", "#555555", "#222222"
 MOST_LISTED, MOST_POINTS = 12, 4000
+RESIDUAL_MM = 10.0  # millimetres at the ends of the residual's colours
 
 
 def plot_scene(
@@ -33,25 +34,31 @@ def plot_scene(
     title: str = "",
     intrinsics: Intrinsics | None = None,
 ) -> Path:
-    """Write a PNG: input depth, reconstruction, segmentation, overlay, posterior samples from above, and what they say.
+    """Write a PNG: input depth, reconstruction, the one less the other, segmentation, overlay, posterior samples from
+    above, and what they say.
 
     depth in metres, NaN where there is no return. With intrinsics given the view from above also shows the surfaces
     that the camera sees of every object. Returns `path`.
     """
-    figure = Figure(figsize=(15, 8.2), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(19.2, 8.2), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=13, color=INK)
-    axes = figure.subplots(2, 3, width_ratios=(1, 1, 1.05))
+    axes = figure.subplots(2, 4, width_ratios=(1, 1, 1, 1.05))
     scale = _depth_scale(depth, posterior)
 
     image = _depth_panel(axes[0, 0], depth, scale, "input depth (grey: no return)")
     _depth_panel(axes[0, 1], posterior.reconstruction, scale, "reconstruction")
-    figure.colorbar(image, ax=axes[0, :2].tolist(), shrink=0.85, pad=0.01, label="depth, m", extend="both")
+    _scale_below(figure, image, axes[0, :2].tolist(), "depth, m")
     _segmentation_panel(axes[1, 0], posterior)
     _overlay_panel(axes[1, 1], depth, posterior, scale)
-    _samples_panel(axes[0, 2], depth, posterior, intrinsics)
-    _words_panel(axes[1, 2], posterior)
+    residual = _residual_panel(axes[0, 2], depth, posterior)
+    _scale_below(figure, residual, [axes[0, 2]], "input less reconstruction, mm")
+    _samples_panel(axes[0, 3], depth, posterior, intrinsics)
+    words = axes[1, 2].get_gridspec()[1, 2:]
+    for axis in axes[1, 2:]:
+        axis.remove()
+    _words_panel(figure.add_subplot(words), posterior)
     figure.savefig(path, dpi=100)
     return path
 
@@ -92,6 +99,21 @@ def colour(label: int) -> str:
 def _depth_panel(axis: Axes, depth: Float[np.ndarray, "height width"], scale: Normalize, title: str) -> Any:
     image = axis.imshow(depth, cmap=colormaps["cividis_r"].with_extremes(bad=NO_RETURN_COLOUR), norm=scale)
     _bare(axis, title)
+    return image
+
+
+def _scale_below(figure: Figure, image: Any, axes: list[Axes], label: str) -> None:
+    scale = figure.colorbar(image, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.02, extend="both")
+    scale.set_label(label, fontsize=9, color=INK)
+    scale.ax.tick_params(labelsize=8, colors=INK)
+
+
+def _residual_panel(axis: Axes, depth: Float[np.ndarray, "height width"], posterior: ScenePosterior) -> Any:
+    """Input less reconstruction: what the scene explains is white."""
+    ends = Normalize(-RESIDUAL_MM, RESIDUAL_MM)
+    tones = colormaps["RdBu"].with_extremes(bad=NO_RETURN_COLOUR)
+    image = axis.imshow(1e3 * (depth - posterior.reconstruction), cmap=tones, norm=ends)
+    _bare(axis, "what the scene does not explain (red: nearer, blue: farther)")
     return image
 
 
@@ -161,6 +183,10 @@ def _samples_panel(
             axis.scatter(place[own, 0], place[own, 1], s=size, c=tone, marker=marker, alpha=alpha, linewidths=0.8)
     for k in range(len(posterior.objects)):
         _place_number(axis, centres[k, 0], centres[k, 1], k + 1, offset=(13, 13))
+    if np.isfinite(posterior.T_camera_table).all():  # else the axes are not those of the table's frame
+        for place in posterior.unexplained:
+            axis.text(place.x, place.y, "?", fontsize=14, fontweight="bold", color=INK, ha="center", va="center")
+            centres = np.concatenate([centres, [[place.x, place.y]]])
 
     # The listed objects fill the view: samples of the prior may lie anywhere on the table.
     around = centres if len(centres) else place
@@ -174,14 +200,14 @@ def _samples_panel(
     axis.tick_params(labelsize=8, colors=INK)
     axis.set_xlabel("x on the table, m", fontsize=9, color=INK)
     axis.set_ylabel("y on the table, m", fontsize=9, color=INK)
-    axis.set_title("samples from above (dots: origins; pale: seen; x: not listed)", fontsize=10, color=INK)
+    axis.set_title("from above (dots: origins; pale: seen; x: not listed; ?: unexplained)", fontsize=10, color=INK)
 
 
 def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
     """A row an object, in its colour, then what is said of the whole scene."""
     axis.axis("off")
     axis.set(xlim=(0, 1), ylim=(0, 1))
-    columns = ((0.0, "object"), (0.52, "p(type)"), (0.66, "p(exists)"), (0.82, "σ"))
+    columns = ((0.0, "object"), (0.36, "p(type)"), (0.48, "p(exists)"), (0.61, "explained"), (0.76, "σ"))
     shown = posterior.objects[:MOST_LISTED]
     step = min(0.085, 0.7 / (len(shown) + 1))
     y = 0.97
@@ -194,6 +220,7 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
             _shorten(found.type, 24),
             f"{found.type_probabilities[found.type]:.3f}",
             f"{found.probability:.3f}",
+            f"{found.explained:.0%}" if np.isfinite(found.explained) else "",
             _spread_words(found),
         )
         for (x, _), text in zip(columns, words, strict=True):
@@ -203,11 +230,12 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
         axis.text(0.055, y, f"and {len(posterior.objects) - MOST_LISTED} more", fontsize=9.5, color=INK, va="top")
     if not shown:
         y -= step
-        axis.text(0.0, y, "no objects", fontsize=11, color=INK, va="top")
+        nothing = "nothing of the library, but something" if posterior.unexplained else "no objects"
+        axis.text(0.0, y, nothing, fontsize=11, color=INK, va="top")
     counts = "   ".join(f"{n}: {p:.2f}" for n, p in posterior.num_objects.items() if p >= 0.005)
     lines = (
         f"p(number of objects)   {counts}",
-        *(line for note in posterior.notes[:2] for line in wrap(note, 74)),  # whole: they say what to make of p(n)
+        *(line for note in posterior.notes[:2] for line in wrap(note, 110)),  # whole: they say what to make of p(n)
         f"depth noise σ {1e3 * posterior.sigma:.2f} mm    outliers {100 * posterior.p_outlier:.1f} %",
         f"log evidence over the empty table {posterior.log_evidence:.1f}    {posterior.seconds:.2f} s",
     )

@@ -16,7 +16,7 @@ from numpy.lib import format as npy
 
 from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
-from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
+from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, UnexplainedPlace
 
 SCENES_FILE, SAMPLES_FILE, FRAMES_FOLDER = "scenes.jsonl", "samples.npz", "frames"
 
@@ -40,6 +40,7 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "T_camera_table": json_numbers(posterior.T_camera_table),
         "ess": json_numbers(posterior.ess),
         "usable_share": json_number(posterior.usable_share),
+        "unexplained": [_place_record(place) for place in posterior.unexplained],
         "notes": list(posterior.notes),
     }
 
@@ -55,6 +56,7 @@ def _object_record(found: ObjectEstimate) -> dict[str, Any]:
         "contact_face": int(found.contact_face),
         "face_probabilities": json_numbers(found.face_probabilities),
         "modes": [_mode_record(mode) for mode in found.modes],
+        "explained": json_number(found.explained),
     }
 
 
@@ -66,6 +68,10 @@ def _mode_record(mode: PoseMode) -> dict[str, Any]:
         "covariance": json_numbers(mode.covariance),
         "contact_face": int(mode.contact_face),
     }
+
+
+def _place_record(place: UnexplainedPlace) -> dict[str, Any]:
+    return {"x": json_number(place.x), "y": json_number(place.y), "z": json_number(place.z), "pixels": place.pixels}
 
 
 class ResultsWriter:

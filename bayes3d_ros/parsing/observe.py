@@ -15,7 +15,7 @@ from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
 from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing.support_plane import find_plane, table_depth, table_frame, usable_share, workspace
-from bayes3d_ros.posterior.types import FEWEST_USABLE, ParseError, usable_note
+from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
 
 
@@ -24,9 +24,12 @@ class Observation(NamedTuple):
 
     image: ScoredImage
     table: Table
+    camera: Intrinsics  # of the image as it is scored; depth and pixel_class have its size
+    depth: Float[np.ndarray, "height width"]  # metres, 0 where there is no return
+    pixel_class: Int[np.ndarray, "height width"]
     T_camera_table: Float[np.ndarray, "4 4"]
     usable_share: float  # of the scored pixels on the table (`support_plane.py`)
-    notes: list[str]  # worst first
+    notes: list[str]  # on where the table comes from
 
 
 def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
@@ -42,10 +45,10 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
     T_camera_table, notes = _find_table(frame, points[returned], settings.table)
     table_size = (settings.table_width, settings.table_depth)
     pixel_class = workspace(points, T_camera_table, table_size, settings.workspace_height)
-    image, table = _as_scored(camera, np.where(returned, depth, 0.0), pixel_class, T_camera_table, settings)
+    depth = np.where(returned, depth, 0.0)
+    image, table = _as_scored(camera, depth, pixel_class, T_camera_table, settings)
     usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
-    notes = [usable_note(usable)] * (usable < FEWEST_USABLE) + notes
-    return Observation(image, table, T_camera_table, usable, notes)
+    return Observation(image, table, camera, depth, pixel_class, T_camera_table, usable, notes)
 
 
 def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, Table]:

@@ -4,6 +4,7 @@
 
 import contextlib
 import time
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.explanation import explain
 from bayes3d_ros.parsing.model_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.observe import bare_table, observe
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
@@ -27,7 +29,7 @@ from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
 from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, draw_table_errors
 from bayes3d_ros.posterior.summarise import summarise
-from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples
+from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import ParserSettings
 
 
@@ -80,11 +82,14 @@ class SceneParser:
         samples, log_evidence = self._mix(stages, seen.table)
         summary = summarise(samples, self.library.names, settings.min_probability, self.library)
         reconstruction, segmentation = self._reconstruct(frame, seen.T_camera_table, samples, summary)
+        noise = float(samples.sigma[summary.reference]), settings.sigma_max
+        explanation = explain(seen, reconstruction, segmentation, len(summary.objects), noise)
+        shares = zip(summary.objects, explanation.explained, strict=True)
         return ScenePosterior(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
             types=self.library.names,
-            objects=summary.objects,
+            objects=tuple(replace(found, explained=share) for found, share in shares),
             num_objects=summary.num_objects,
             p_outlier=summary.p_outlier,
             sigma=summary.sigma,
@@ -96,8 +101,9 @@ class SceneParser:
             T_camera_table=seen.T_camera_table,
             ess=tuple(ess),
             seconds=time.perf_counter() - start,
-            notes=tuple(seen.notes),
+            notes=(*warning_notes(seen.usable_share, explanation.unexplained), *seen.notes),
             usable_share=seen.usable_share,
+            unexplained=explanation.unexplained,
         )
 
     def _context(self, image: ScoredImage, table: Table) -> tuple[Context, NoiseGrid]:

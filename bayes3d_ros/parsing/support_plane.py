@@ -136,7 +136,7 @@ def workspace(
         raise ParseError("no table in sight: nothing is seen of its surface inside the table's area")
     over = np.zeros(candidate.shape, bool)
     over[candidate] = hull.find_simplex(local[candidate][:, :2]) >= 0
-    pieces, count = _pieces(candidate & ~flat, z_camera)
+    pieces, count = connected_pieces(candidate & ~flat, z_camera)
     stands = np.zeros(candidate.shape, bool)
     if count:
         share = ndimage.mean(over, pieces, np.arange(count + 1))
@@ -176,8 +176,10 @@ def usable_share(
     return float((pixel_class[met][on_table] != NO_RETURN).mean()) if on_table.any() else float("nan")
 
 
-def _pieces(risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], int]:
-    """Pieces of an image connected without a jump in depth."""
+def connected_pieces(
+    risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]
+) -> tuple[Int[np.ndarray, "H W"], int]:
+    """Pieces of a part of an image that are connected without a jump in depth: labels from 1 on, and how many."""
     # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
     with np.errstate(invalid="ignore"):
         cut = np.zeros(risen.shape, bool)

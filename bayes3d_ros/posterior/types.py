@@ -2,6 +2,7 @@
 
 """The posterior over scenes: weighted samples, and the summaries that people and robots read."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -54,6 +55,18 @@ class ObjectEstimate:
     contact_face: int  # of the heaviest mode
     modes: tuple[PoseMode, ...] = ()  # heaviest first; empty where they were not worked out
     face_probabilities: tuple[float, ...] = ()  # p(face 0) .. p(face 5); empty likewise
+    # Of its visible scored pixels that returned, the share whose return is where the best scene puts it; NaN where
+    # there are none, or where it was not worked out.
+    explained: float = float("nan")
+
+
+class UnexplainedPlace(NamedTuple):
+    """Connected returns that stand above the table and belong to nothing in the best scene."""
+
+    x: float  # the middle of the returns in the table's frame, metres
+    y: float
+    z: float
+    pixels: int  # how many returns, of the image that is scored
 
 
 @dataclass(frozen=True)
@@ -79,17 +92,36 @@ class ScenePosterior:
     # Of the scored pixels that look at the table's prior area, the share whose return the likelihood makes use of. NaN
     # where it is not known. Where it is too low, `notes` says so.
     usable_share: float = float("nan")
+    unexplained: tuple[UnexplainedPlace, ...] = ()  # most returns first
 
     @property
     def too_little_usable(self) -> bool:
         """Whether so few pixels on the table could be used that objects may be missed or mistaken."""
         return self.usable_share < FEWEST_USABLE
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those of the notes without which the posterior would be misread, worst first."""
+        return warning_notes(self.usable_share, self.unexplained)
+
+
+def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace]) -> tuple[str, ...]:
+    """What nobody should read a posterior without, worst first."""
+    usable = (usable_note(usable_share),) if usable_share < FEWEST_USABLE else ()
+    return (*usable, *((unexplained_note(unexplained),) if unexplained else ()))
+
 
 def usable_note(share: float) -> str:
     """What to say of too low a share of usable pixels."""
     why = "no return, or beside a depth edge or a missing pixel"
     return f"only {share:.0%} of the pixels on the table can be used ({why}): objects may be missed or mistaken"
+
+
+def unexplained_note(places: Sequence[UnexplainedPlace]) -> str:
+    """What to say of places where returns stand above the table that no surface of the scene explains."""
+    where = ", ".join(f"x {p.x:.2f} y {p.y:.2f} m ({p.pixels} pixels)" for p in places[:3])
+    more = f" and {len(places) - 3} more" if len(places) > 3 else ""
+    return f"returns above the table that belong to none of the objects, in the table's frame at {where}{more}"
 
 
 class ParseError(Exception):

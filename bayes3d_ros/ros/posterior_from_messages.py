@@ -2,6 +2,7 @@
 
 """A posterior put together again from the messages of one stamp: what a subscriber can know."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.summarise import object_estimates
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
 from bayes3d_ros.ros.from_messages import depth_from_image, labels_from_image, rows_from_cloud, stamp_to_ns
+from bayes3d_ros.ros.summary import UNEXPLAINED, place_from_words
 
 
 def stamp_of(message: Any) -> int:
@@ -48,13 +50,15 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     cloud = messages["posterior"]
     samples, object_index = samples_from_rows(rows_from_cloud(cloud))
     weights = np.exp(samples.log_weight.astype(float))
-    scene = messages["summary"].status[0]
+    scene, *told = messages["summary"].status
     values = {pair.key: pair.value for pair in scene.values}
+    objects = object_estimates(samples, object_index, library.names, len(messages["poses"].poses))
+    explained = [next(float(pair.value) for pair in status.values if pair.key == "explained") for status in told]
     return ScenePosterior(
         stamp_ns=stamp_of(cloud),
         frame_id=cloud.header.frame_id,
         types=library.names,
-        objects=object_estimates(samples, object_index, library.names, len(messages["poses"].poses)),
+        objects=tuple(replace(found, explained=share) for found, share in zip(objects, explained, strict=True)),
         num_objects={n: float(weights[samples.num_objects == n].sum()) for n in range(samples.num_objects.max() + 1)},
         p_outlier=float(weights @ samples.p_outlier),
         sigma=float(weights @ samples.sigma),
@@ -67,5 +71,6 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
         ess=tuple(float(e) for e in values["ess"].split()),
         seconds=float(values["ms"]) / 1e3,
         usable_share=float(values["usable share"]),
+        unexplained=tuple(place_from_words(pair.value) for pair in scene.values if pair.key == UNEXPLAINED),
         notes=tuple(pair.value for pair in scene.values if pair.key == "note"),
     )

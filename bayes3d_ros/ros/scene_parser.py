@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
-from bayes3d_ros.posterior.types import ParseError, usable_note
+from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
@@ -220,9 +220,8 @@ class SceneParserNode(Node):
             self._parts.problem(str(error), why)
             return
         self._outputs.scene(posterior, ready.parser.library, ready.markers)
-        warnings = [usable_note(posterior.usable_share)] if posterior.too_little_usable else []
         latency = time.monotonic() - messages.arrived
-        health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
+        health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 
     def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:
         """Compile for images of a frame's size, where that is needed, and say so."""

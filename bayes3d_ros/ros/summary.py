@@ -5,8 +5,10 @@
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
+from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, UnexplainedPlace
 from bayes3d_ros.ros.to_messages import header
+
+UNEXPLAINED = "unexplained"  # key of a place in the scene's status
 
 
 def key_values(**values: str) -> list[KeyValue]:
@@ -16,8 +18,10 @@ def key_values(**values: str) -> list[KeyValue]:
 
 def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     """One status for the scene, then one per object, in the order of their labels."""
-    names = ", ".join(o.type for o in posterior.objects) or "no object"
-    scene = DiagnosticStatus(name="scene", hardware_id=posterior.frame_id, message=names)
+    nothing = "no object of the library, but something unexplained" if posterior.unexplained else "no object"
+    names = ", ".join(o.type for o in posterior.objects) or nothing
+    level = DiagnosticStatus.WARN if posterior.warnings else DiagnosticStatus.OK
+    scene = DiagnosticStatus(level=level, name="scene", hardware_id=posterior.frame_id, message=names)
     scene.values = key_values(
         p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
         log_evidence=f"{posterior.log_evidence:.2f}",
@@ -26,9 +30,22 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
         ess=" ".join(f"{e:.2f}" for e in posterior.ess),
         ms=f"{posterior.seconds * 1e3:.0f}",
         usable_share=f"{posterior.usable_share:.2f}",
-    ) + [KeyValue(key="note", value=note) for note in posterior.notes]
+    )
+    scene.values += [KeyValue(key=UNEXPLAINED, value=place_words(place)) for place in posterior.unexplained]
+    scene.values += [KeyValue(key="note", value=note) for note in posterior.notes]
     objects = [_object_status(k, o, posterior.frame_id) for k, o in enumerate(posterior.objects, start=1)]
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])
+
+
+def place_words(place: UnexplainedPlace) -> str:
+    """A place where something stands that the scene does not hold."""
+    return f"x {place.x:.3f} y {place.y:.3f} z {place.z:.3f} m, {place.pixels} pixels"
+
+
+def place_from_words(words: str) -> UnexplainedPlace:
+    """The place that `place_words` put into words."""
+    _, x, _, y, _, z, _, pixels, _ = words.split()
+    return UnexplainedPlace(float(x), float(y), float(z), int(pixels))
 
 
 def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> DiagnosticStatus:
@@ -37,6 +54,7 @@ def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> Diagn
     status.message = f"p(exists) {estimate.probability:.3f}"
     status.values = key_values(
         p_exists=f"{estimate.probability:.4f}",
+        explained=f"{estimate.explained:.3f}",
         p_type=" ".join(f"{name}: {p:.3f}" for name, p in estimate.type_probabilities.items()),
         position_m=spaced(estimate.position, 4),
         orientation_xyzw=spaced(estimate.orientation, 4),

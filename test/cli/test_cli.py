@@ -22,7 +22,7 @@ from bayes3d_ros.io.bags import BagWriter, read_frames
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.parsing import parser
-from bayes3d_ros.posterior.types import ParseError, usable_note
+from bayes3d_ros.posterior.types import ParseError, UnexplainedPlace, usable_note, warning_notes
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.tracking import session, tracker
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, TrackingError
@@ -135,6 +135,17 @@ def test_that_too_few_pixels_can_be_used_is_said_of_every_frame(depth_frame, fak
     assert note_lines(posterior, ()) == [f"1  note: {low}", "1  note: made up"]
     assert note_lines(posterior, posterior.notes) == [f"1  note: {low}"] and "15% of the pixels" in low
     assert note_lines(replace(posterior, usable_share=float("nan")), posterior.notes) == []
+
+
+def test_unexplained_places_are_told_of_every_frame(depth_frame, fake_posterior):
+    places = tuple(UnexplainedPlace(0.1 * k, -0.05, 0.06, 240 - k) for k in range(5))
+    (note,) = warning_notes(1.0, places)
+    assert note == (
+        "returns above the table that belong to none of the objects, in the table's frame at "
+        "x 0.00 y -0.05 m (240 pixels), x 0.10 y -0.05 m (239 pixels), x 0.20 y -0.05 m (238 pixels) and 2 more"
+    )
+    posterior = replace(fake_posterior(depth_frame(), ("block",), 0), unexplained=places, notes=(note, "made up"))
+    assert note_lines(posterior, posterior.notes) == [f"1  note: {note}"]
 
 
 def test_options_become_settings(bag, library, parsers, tmp_path):

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from bayes3d_ros.geometry.camera import Intrinsics, project, resize_depth, trustworthy, unproject
+from bayes3d_ros.geometry.camera import Intrinsics, project, resize_nearest, trustworthy, unproject
 
 CAMERA = Intrinsics(fx=610.0, fy=605.0, cx=321.3, cy=238.6, width=640, height=480)
 
@@ -28,7 +28,9 @@ def test_picked_pixels_keep_their_rays(factor):
     small = camera.subsampled(120, 90)
     # An image that holds each pixel's own ray, resized as depth is, holds the small camera's rays.
     for axis in range(2):
-        np.testing.assert_allclose(resize_depth(camera.rays()[..., axis], 120, 90), small.rays()[..., axis], atol=1e-6)
+        np.testing.assert_allclose(
+            resize_nearest(camera.rays()[..., axis], 120, 90), small.rays()[..., axis], atol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -36,7 +38,7 @@ def test_picked_pixels_keep_their_rays(factor):
 )
 def test_resized_points_stay_on_their_plane(width, height, off):
     """To rounding for whole factors; for others points are up to half a source pixel off, but not all to one side."""
-    points = unproject(resize_depth(slanted(CAMERA), width, height), CAMERA.subsampled(width, height))
+    points = unproject(resize_nearest(slanted(CAMERA), width, height), CAMERA.subsampled(width, height))
     distance = points @ [1.0, 2.0, 3.0] - 3
     assert np.abs(distance).max() < off
     assert abs(distance.mean()) < 1e-4

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.image import imread
 
 from bayes3d_ros.io.plots import COLOURS, _view_from_above, colour, plot_scene
-from bayes3d_ros.posterior.types import usable_note
+from bayes3d_ros.posterior.types import UnexplainedPlace, usable_note
 
 TYPES = ("bowl", "can", "mug")
 
@@ -24,7 +24,7 @@ def test_a_picture_of_a_scene(tmp_path, depth_frame, fake_posterior, objects):
         path = plot_scene(
             frame.depth, fake_posterior(frame, TYPES, objects), tmp_path / "a.png", "title", frame.intrinsics
         )
-    assert imread(path).shape == (820, 1500, 4)
+    assert imread(path).shape == (820, 1920, 4)
 
 
 def test_a_warning_about_missing_pixels_stands_whole_in_the_picture(tmp_path, depth_frame, fake_posterior, monkeypatch):
@@ -35,6 +35,24 @@ def test_a_warning_about_missing_pixels_stands_whole_in_the_picture(tmp_path, de
     plot_scene(frame.depth, posterior, tmp_path / "a.png")
     (counts,) = [text for text in written if "p(number of objects)" in text]
     assert note in counts.replace("\n", " ") and "made up" in counts
+
+
+def test_what_the_scene_does_not_hold_is_marked(tmp_path, depth_frame, fake_posterior, monkeypatch):
+    frame, written = depth_frame(), []
+    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: written.append((x, y, text)))
+    place = UnexplainedPlace(0.12, -0.05, 0.06, 240)
+    plot_scene(frame.depth, replace(fake_posterior(frame, TYPES, 0), unexplained=(place,)), tmp_path / "a.png")
+    assert (0.12, -0.05, "?") in written
+    assert any(text == "nothing of the library, but something" for _, _, text in written)
+
+
+def test_the_residual_is_red_where_the_input_is_nearer(tmp_path, depth_frame, fake_posterior):
+    frame = depth_frame()
+    posterior = fake_posterior(frame, TYPES)
+    nearer = imread(plot_scene(posterior.reconstruction - 0.02, posterior, tmp_path / "a.png"))[..., :3]
+    same = imread(plot_scene(posterior.reconstruction, posterior, tmp_path / "b.png"))[..., :3]
+    red = np.array([0x67, 0x00, 0x1F]) / 255  # the end of the colours
+    assert [(np.abs(picture - red).max(-1) < 0.01).sum() > 30_000 for picture in (nearer, same)] == [True, False]
 
 
 def test_masks_have_the_colours_of_their_labels(tmp_path, depth_frame, fake_posterior):

@@ -14,11 +14,11 @@ from bayes3d_ros.posterior.summarise import posterior_rows
 TYPES = ("bowl", "can", "mug")
 KEYS = [
     "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects",
-    "T_camera_table", "ess", "usable_share", "notes",
+    "T_camera_table", "ess", "usable_share", "unexplained", "notes",
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes",
+    "face_probabilities", "modes", "explained",
 ]  # fmt: skip
 
 

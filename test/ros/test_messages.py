@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 import array
-import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Pose, Quaternion
 from sensor_msgs.msg import CameraInfo, Image, PointField
 from std_msgs.msg import Header
@@ -13,7 +14,7 @@ from visualization_msgs.msg import Marker
 
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
-from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
+from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples, UnexplainedPlace
 from bayes3d_ros.ros import detections, from_messages, to_messages
 from bayes3d_ros.ros.markers import SceneMarkers, principal_axes
 from bayes3d_ros.ros.summary import summary_message
@@ -202,9 +203,18 @@ def test_the_summary_says_what_a_person_asks(library) -> None:
     values = {v.key: v.value for v in message.status[0].values}
     assert values["ms"] == "250" and values["log evidence"] == "3.00" and "2: " in values["p n"]
     assert values["note"] == "table found in the depth"
+    assert message.status[0].level == DiagnosticStatus.OK and "unexplained" not in values
     values = {v.key: v.value for v in message.status[1].values}
     assert values["p face"] == "5: 1.000" and values["p mode"] == "1: 1.000" and "mode 1" not in values
     assert "brick: 1.000" in values["p type"] and len(values["sigma position mm"].split()) == 3
+
+
+def test_the_summary_does_not_say_that_a_table_is_empty_where_something_stands(library) -> None:
+    posterior = replace(scene(library.names), objects=(), unexplained=(UnexplainedPlace(0.12, -0.05, 0.06, 240),))
+    (status,) = summary_message(posterior).status
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message == "no object of the library, but something unexplained"
+    assert {v.key: v.value for v in status.values}["unexplained"] == "x 0.120 y -0.050 z 0.060 m, 240 pixels"
 
 
 def two_modes(names: tuple[str, ...]) -> ScenePosterior:
@@ -213,8 +223,8 @@ def two_modes(names: tuple[str, ...]) -> ScenePosterior:
     first = posterior.objects[0]
     (mode,) = first.modes
     turned = mode._replace(weight=0.3, orientation=np.array([0.0, 0.0, 1.0, 0.0]))
-    changed = dataclasses.replace(first, modes=(mode._replace(weight=0.7), turned))
-    return dataclasses.replace(posterior, objects=(changed, *posterior.objects[1:]))
+    changed = replace(first, modes=(mode._replace(weight=0.7), turned))
+    return replace(posterior, objects=(changed, *posterior.objects[1:]))
 
 
 def test_the_summary_and_the_markers_say_where_else_an_object_may_be(library) -> None:
@@ -245,9 +255,7 @@ def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> N
     kind[25:28, 0] = 1  # as well a cube
     samples = samples._replace(orientation=turned, type=kind)
     summary = summarise(samples, library.names, 0.5)
-    posterior = dataclasses.replace(
-        posterior, samples=samples, objects=summary.objects, object_index=summary.object_index
-    )
+    posterior = replace(posterior, samples=samples, objects=summary.objects, object_index=summary.object_index)
     first, second = detections.detection_array(posterior, library).detections
     scores = [result.hypothesis.score for result in first.results]
     assert scores == sorted(scores, reverse=True)

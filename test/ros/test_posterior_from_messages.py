@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bayes3d_ros.posterior.summarise import posterior_rows
+from bayes3d_ros.posterior.types import UnexplainedPlace
 from bayes3d_ros.ros import to_messages
 from bayes3d_ros.ros.posterior_from_messages import posterior_from_messages, samples_from_rows
 from bayes3d_ros.ros.summary import summary_message
+
+PLACES = (UnexplainedPlace(0.125, -0.05, 0.0, 240), UnexplainedPlace(-1.5, 0.25, 0.062, 31))
 
 
 def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
@@ -26,6 +31,8 @@ def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
 
 def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library) -> None:
     posterior = fake_posterior(depth_frame(12_345), library.names)
+    explained = tuple(replace(found, explained=0.25 * k) for k, found in enumerate(posterior.objects, start=1))
+    posterior = replace(posterior, objects=explained, unexplained=PLACES)
     messages = {
         "posterior": to_messages.posterior_cloud(posterior),
         "poses": to_messages.pose_array(posterior),
@@ -45,4 +52,6 @@ def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library)
     np.testing.assert_array_equal(again.object_index, posterior.object_index[:, : again.object_index.shape[1]])
     assert again.num_objects == pytest.approx(posterior.num_objects)
     assert (again.p_outlier, again.sigma) == pytest.approx((posterior.p_outlier, posterior.sigma))
+    assert [o.explained for o in again.objects] == [o.explained for o in posterior.objects]
+    assert again.unexplained == PLACES and again.warnings == posterior.warnings
     assert again.notes == posterior.notes and again.seconds == posterior.seconds
