@@ -19,6 +19,7 @@ EXPERIMENTS: dict[str, str] = {
     "exactness": "bayes3d_ros.validation.experiments.exactness",
     "learning": "bayes3d_ros.validation.experiments.learning",
     "parsing": "bayes3d_ros.validation.experiments.parsing",
+    "planted": "bayes3d_ros.validation.experiments.planted",
     "repeatability": "bayes3d_ros.validation.experiments.repeatability",
 }
 
