@@ -2,8 +2,8 @@
 
 """The fast renderer: walk each ray through the voxel grid, skipping empty space, to the first plane it meets.
 
-What is rendered (the reference renders the same): a surface voxel is hit where the ray, having entered its cube, meets
-its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
+What is rendered (`slow_renderer.py` renders the same): a surface voxel is hit where the ray, having entered its cube,
+meets its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
 Most rays end within a few steps and a few graze on for dozens: after the first steps those left are packed together.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.likelihood import reference
+from bayes3d_ros.likelihood import slow_renderer
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.reference import render
+from bayes3d_ros.likelihood.slow_renderer import render
 from bayes3d_ros.objects.library_arrays import OFFSET_RANGE
 
 SIDE = 40
@@ -180,15 +180,15 @@ def test_never_nan_nor_behind(cast):
 
 
 @pytest.mark.parametrize("distance", [40.0, 9.0, 1.0, 0.0], ids="{:g} voxels off".format)
-def test_the_reference_leaves_no_voxel_out(distance):
+def test_the_slow_renderer_leaves_no_voxel_out(distance):
     """Every cube that a ray enters ahead of the eye is among the pairs, and few others from afar."""
     rng = np.random.default_rng(0)
     from_eye = rng.uniform(-4, 4, (200, 3)) + np.array([0.0, 0.0, distance])
     directions = np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)), np.ones(300)])
-    pairs = list(reference._pairs(from_eye, directions))
+    pairs = list(slow_renderer._pairs(from_eye, directions))
     told = {(ray, cube) for rays, cubes in pairs for ray, cube in zip(rays, cubes, strict=True)}
     assert len(told) == sum(len(rays) for rays, _ in pairs)
-    enter, leave = reference._cube(from_eye, directions[:, None])
+    enter, leave = slow_renderer._cube(from_eye, directions[:, None])
     meet = set(zip(*np.nonzero((enter <= leave) & (leave > 0)), strict=True))
     assert meet and meet <= told
     assert distance < 2 or len(told) < 0.2 * len(directions) * len(from_eye)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whole frames: right answers on images of our own reference, reproducible, and compiled once."""
+"""Whole frames: right answers on images of our own slow renderer, reproducible, and compiled once."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ import trimesh
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.likelihood import reference
+from bayes3d_ros.likelihood import slow_renderer
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing import smc
@@ -52,7 +52,7 @@ def camera_pose():
 
 
 def frame(library, objects, seed=0, stamp_ns=1_700_000_000_000_000_000, camera=CAMERA, pose=True):
-    """A depth frame of objects (index, x, y, yaw) standing as their meshes do, drawn by the reference renderer."""
+    """A depth frame of objects (index, x, y, yaw) standing as their meshes do, drawn by the slow renderer."""
     T_table_camera = camera_pose()
     T_camera_table = np.linalg.inv(T_table_camera)
     rays = camera.rays()
@@ -65,7 +65,7 @@ def frame(library, objects, seed=0, stamp_ns=1_700_000_000_000_000_000, camera=C
         T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         T[:3, 3] = [x, y, -model.surface_points[:, 2].min()]
         truth.append(T_camera_table @ T)
-        depth = np.minimum(depth, reference.render(model, truth[-1], rays.reshape(-1, 3)).reshape(depth.shape))
+        depth = np.minimum(depth, slow_renderer.render(model, truth[-1], rays.reshape(-1, 3)).reshape(depth.shape))
     depth = depth + np.random.default_rng(seed).normal(0, SIGMA, depth.shape)
     depth = depth.astype(np.float32)
     return DepthFrame(depth, camera, stamp_ns, "camera", T_table_camera if pose else None), truth

@@ -14,7 +14,7 @@ from bayes3d_ros.geometry.camera import Intrinsics, project
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import direction, look_at
-from bayes3d_ros.likelihood import reference
+from bayes3d_ros.likelihood import slow_renderer
 from bayes3d_ros.objects.model import ObjectModel
 from bayes3d_ros.validation.simulate.ray_casting import RayCaster
 from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
@@ -53,7 +53,7 @@ def panning_cameras(model: ObjectModel, frames: int, seed: int) -> list[Float[np
 
 
 def own_frames(model: ObjectModel, poses: list[Float[np.ndarray, "4 4"]], size: int) -> Iterator[DepthFrame]:
-    """The voxel model by the reference renderer, float64 and without noise, `size` pixels across."""
+    """The voxel model by the slow renderer, float64 and without noise, `size` pixels across."""
     camera = pinhole(size)
     rays = camera.rays()
     corners = model.origin + np.indices((2, 2, 2)).reshape(3, -1).T * np.array(model.occupancy.shape) * model.voxel_size
@@ -63,7 +63,7 @@ def own_frames(model: ObjectModel, poses: list[Float[np.ndarray, "4 4"]], size: 
         (u0, v0), (u1, v1) = np.clip([np.floor(pixels.min(0)), np.ceil(pixels.max(0)) + 1], 0, size).astype(int)
         depth = np.full((size, size), np.inf)
         part = rays[v0:v1, u0:u1]
-        depth[v0:v1, u0:u1] = reference.render(model, T_camera_object, part.reshape(-1, 3)).reshape(part.shape[:2])
+        depth[v0:v1, u0:u1] = slow_renderer.render(model, T_camera_object, part.reshape(-1, 3)).reshape(part.shape[:2])
         yield _frame(np.where(np.isfinite(depth), depth, WALL), camera, k)
 
 
