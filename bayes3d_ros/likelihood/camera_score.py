@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.geometry.se3 import product
+from bayes3d_ros.likelihood.backends import depth_kernel, kernel
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, log_likelihood, outlier_density
-from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses
 from bayes3d_ros.likelihood.march import NO_SURFACE, march
 from bayes3d_ros.likelihood.plane import plane_depth, upper_side

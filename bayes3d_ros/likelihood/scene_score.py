@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from bayes3d_ros.likelihood.backends import depth_kernel, kernel
 from bayes3d_ros.likelihood.density import Noise, Pixels, log_likelihood
-from bayes3d_ros.likelihood.dispatch import depth_kernel, kernel
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import NO_SURFACE, march
 from bayes3d_ros.likelihood.scored_image import ScoredImage, observed

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which renderer hypotheses are scored by: a kernel that renders and scores at once, chosen by backend and by what the
-image holds; where there is none, `march.py` renders and `tiles.py` scores."""
+"""Which backend renders and scores hypotheses: a kernel of this machine, or XLA's own code; register a new one here.
+
+A kernel renders and scores at once; it is chosen by JAX's default backend and by what the image holds. Where there is
+none, the callers in `scene_score.py` and `camera_score.py` fall back: `march.py` renders and `tiles.py` scores.
+"""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
