@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.context import Context

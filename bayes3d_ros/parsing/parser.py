@@ -13,8 +13,8 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.poses import pose_matrix
-from bayes3d_ros.likelihood import noise as noise_model
-from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood import noise_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
@@ -45,9 +45,9 @@ class SceneParser:
     def __init__(self, library: Library, settings: ParserSettings = ParserSettings()) -> None:
         self.library, self.settings = library, settings
         self._arrays = library_arrays(library)
-        self._grid = noise_model.noise_grid(settings.sigma_max)
+        self._grid = noise_marginal.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
-        self._sample_noise = jax.jit(noise_model.sample)
+        self._sample_noise = jax.jit(noise_marginal.sample)
         self._draw_offsets = jax.jit(draw_offsets, static_argnames="window")
         self._draw_table_errors = jax.jit(draw_table_errors, static_argnames="count")
         bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
@@ -107,7 +107,7 @@ class SceneParser:
         )
 
     def _context(self, image: ScoredImage, table: Table) -> tuple[Context, NoiseGrid]:
-        return Context(image, self._arrays, table), noise_model.for_image(self._grid, image, self.settings.window)
+        return Context(image, self._arrays, table), noise_marginal.for_image(self._grid, image, self.settings.window)
 
     def _sample(self, key: PRNGKeyArray, context: Context, grid: NoiseGrid) -> tuple[list[Stage], list[float]]:
         """Stages of the sampler, from the empty table to more objects than the image bears out."""

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of

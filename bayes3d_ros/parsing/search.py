@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
-from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal, near_peak, peak
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal, near_peak, peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage, halved
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays

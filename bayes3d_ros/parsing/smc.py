@@ -3,9 +3,9 @@
 """Sequential Monte Carlo over the objects of a scene (Bayes3D, Methodology, B), with the paper's gaps closed.
 
 Stage k carries weighted scenes of k objects towards p_k, the posterior given k objects. The noise variables are
-integrated out of every target (`noise.py`), so none is replaced between stages and W_i needs no kernel for them. Scenes
-are sets: a set of k objects has k! orders, the sampler makes one of them, and the backward kernel says which object
-came last: the one that explains least alone, since the search adds what explains most first.
+integrated out of every target (`noise_marginal.py`), so none is replaced between stages and W_i needs no kernel for
+them. Scenes are sets: a set of k objects has k! orders, the sampler makes one of them, and the backward kernel says
+which object came last: the one that explains least alone, since the search adds what explains most first.
 
 An object is not weighted at once but along a path from the proposal to the target by steps, resampled and moved between
 them (Del Moral et al. 2006). The likelihood of an object's pose is sharp and uneven; a mixture that fits it well leaves
@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood import noise as noise_model
-from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood import noise_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
@@ -120,7 +120,7 @@ def step(
     def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
         gain = log_likelihood_gain(new, ancestor, state.scenes, *context, grid.coarse, window)
         summed = state.loglik_grid[ancestor] + gain
-        log_likelihood = noise_model.log_marginal(summed, grid)
+        log_likelihood = noise_marginal.log_marginal(summed, grid)
         log_q = log_density(new, proposal, library, table)
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)

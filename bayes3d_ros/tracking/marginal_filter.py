@@ -25,10 +25,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.se3 import exp_about, inverse, log_about, log_volume, product, rigid
-from bayes3d_ros.likelihood import noise as noise_model
+from bayes3d_ros.likelihood import noise_marginal
 from bayes3d_ros.likelihood.camera_score import log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import ScoredImage, at_most
 from bayes3d_ros.likelihood.sharding import over_devices
 from bayes3d_ros.sampling import student_t
@@ -189,14 +189,14 @@ def step(
         jnp.log(FILTER.from_motion) + log_prior,
     )
     # Noise about the best for the pose that the search ended at: no draw has a say in it, and the rest has no mass.
-    near = noise_model.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, FILTER.noise_levels)
+    near = noise_marginal.near_peak(score(chart.pose(chart.mean)[None], grid.coarse)[0], grid, FILTER.noise_levels)
     loglik_grid = score(T, near.coarse)
-    log_likelihood = noise_model.log_marginal(loglik_grid, near)
+    log_likelihood = noise_marginal.log_marginal(loglik_grid, near)
     log_weight, log_evidence = normalised(log_likelihood + log_prior - log_q)
     ancestor = jax.random.categorical(ancestor_key, by_ancestor)
     T = rigid(T)
     moved = rigid(product(T, inverse(before[ancestor])))
-    noise = noise_model.peak(loglik_grid[jnp.argmax(log_weight)], near)
+    noise = noise_marginal.peak(loglik_grid[jnp.argmax(log_weight)], near)
     new = FilterState(T, moved, log_weight, noise.sigma[0], noise.p_outlier[0])
     mean, covariance = _moments(chart, T, log_weight)
     return new, FilterInfo(

@@ -17,7 +17,7 @@ from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.geometry.se3 import exp_about, inverse, log_about, product, quaternions
 from bayes3d_ros.likelihood.camera_score import World, render_cameras
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
-from bayes3d_ros.likelihood.noise import for_returns, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import for_returns, noise_grid
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape, scored_image
 from bayes3d_ros.likelihood.sharding import on_all
 from bayes3d_ros.objects.library_arrays import library_arrays

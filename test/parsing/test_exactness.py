@@ -12,7 +12,7 @@ import pytest
 
 from bayes3d_ros.likelihood import density
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Noise, Pixels
-from bayes3d_ros.likelihood.noise import for_image, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import for_image, noise_grid
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import search, smc
 from bayes3d_ros.validation.experiments import exactness

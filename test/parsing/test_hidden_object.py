@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bayes3d_ros.likelihood.noise import log_marginal, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import log_marginal, noise_grid
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
 from bayes3d_ros.objects.library_arrays import NUM_FACES, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from bayes3d_ros.likelihood.noise import log_marginal, noise_grid, sample
+from bayes3d_ros.likelihood.noise_marginal import log_marginal, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc

@@ -14,7 +14,7 @@ from bayes3d_ros.geometry import se3
 from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.likelihood.camera_score import World, depth_along, log_likelihood_of_cameras
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE
-from bayes3d_ros.likelihood.noise import for_returns, log_marginal, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import for_returns, log_marginal, noise_grid
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood.density import Noise
-from bayes3d_ros.likelihood.noise import for_image
+from bayes3d_ros.likelihood.noise_marginal import for_image
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc

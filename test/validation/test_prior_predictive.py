@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import kstest
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Likelihood, Pixels, inlier_density, outlier_density
-from bayes3d_ros.likelihood.noise import NoiseGrid, noise_grid, sample
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.placement import log_prior, overlap

@@ -15,9 +15,9 @@ import trimesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.likelihood import noise as noise_model
+from bayes3d_ros.likelihood import noise_marginal
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Likelihood
-from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
@@ -104,7 +104,7 @@ def small_problem(settings: ParserSettings = SETTINGS) -> CalibrationProblem:
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
-    grid = noise_model.noise_grid(settings.sigma_max)
+    grid = noise_marginal.noise_grid(settings.sigma_max)
     return CalibrationProblem(library_arrays(small_library()), table, blank, grid, limits, log_count, settings)
 
 
@@ -150,7 +150,7 @@ def observe(
 def log_likelihood(surface: Float[np.ndarray, "H W"], image: ScoredImage, problem: CalibrationProblem) -> float:
     """log p(image | rendered depth), noise integrated out, with the constant of `Samples`."""
     window = problem.settings.window
-    grid = noise_model.for_image(problem.grid, image, window)
+    grid = noise_marginal.for_image(problem.grid, image, window)
     return float(_log_likelihood(jnp.asarray(surface), image, grid, window))
 
 
@@ -158,16 +158,16 @@ def log_likelihood(surface: Float[np.ndarray, "H W"], image: ScoredImage, proble
 def _log_likelihood(surface: Float[Array, "H W"], image: ScoredImage, grid: NoiseGrid, window: int) -> Float[Array, ""]:
     scenes = pad_scene(jnp.stack([image.bare_depth, surface]), window)
     empty, loglik_grid = log_likelihood_scene(scenes, image, grid.coarse, window)
-    return noise_model.log_marginal((loglik_grid - empty.max())[None], grid)[0]
+    return noise_marginal.log_marginal((loglik_grid - empty.max())[None], grid)[0]
 
 
-_sample_noise = jax.jit(noise_model.sample)
+_sample_noise = jax.jit(noise_marginal.sample)
 
 
 def sample(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProblem) -> Samples:
     """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
     settings, context = problem.settings, Context(image, problem.library, problem.table)
-    grid = noise_model.for_image(problem.grid, image, settings.window)
+    grid = noise_marginal.for_image(problem.grid, image, settings.window)
     state = smc.init(context, grid, settings.particles, settings.max_objects, _table_size(settings), settings.window)
     stages, ess, log_mass = [], [], []
     for number in range(settings.max_objects + 1):

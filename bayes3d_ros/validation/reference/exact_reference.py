@@ -4,8 +4,8 @@
 
 The space of one object (type, face, x, y, yaw) is tiled with cells. Each has the value of prior times likelihood at its
 middle, noise integrated out; cells that matter are halved along x, y and yaw, until the evidence no longer moves. Of
-the model only the renderer, `log_prior`, `log_likelihood_gain`, `log_likelihood_scene` and `noise.log_marginal` are
-used.
+the model only the renderer, `log_prior`, `log_likelihood_gain`, `log_likelihood_scene` and
+`noise_marginal.log_marginal` are used.
 """
 
 import os
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.noise import NoiseGrid, log_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES
 from bayes3d_ros.objects.placement import Placement, T_camera_object, log_prior

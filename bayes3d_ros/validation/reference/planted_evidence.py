@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayes3d_ros.likelihood.noise import NoiseGrid, for_image, log_marginal, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, for_image, log_marginal, noise_grid
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, log_prior

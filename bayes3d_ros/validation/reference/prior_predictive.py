@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Pixels, inlier_density
-from bayes3d_ros.likelihood.noise import NoiseGrid
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import FreePoints
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, overlap

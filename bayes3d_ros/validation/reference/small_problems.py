@@ -14,7 +14,7 @@ from jaxtyping import Float
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.noise import NoiseGrid, for_image, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, for_image, noise_grid
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh

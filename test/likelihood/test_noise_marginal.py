@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit, logsumexp
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
-from bayes3d_ros.likelihood.noise import _splines, for_returns, log_marginal, noise_grid, peak, sample
+from bayes3d_ros.likelihood.noise_marginal import _splines, for_returns, log_marginal, noise_grid, peak, sample
 
 SIGMA_MAX = 0.005
 LOG_SIGMA = np.log(SIGMA_MAX / 10), np.log(SIGMA_MAX)
