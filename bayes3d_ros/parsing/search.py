@@ -25,7 +25,6 @@ from bayes3d_ros.parsing.coarse_search import (
     score_cells,
     surface_score,
 )
-from bayes3d_ros.parsing.consensus import consensus
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mode_search import (
     Hypotheses,
@@ -39,6 +38,7 @@ from bayes3d_ros.parsing.mode_search import (
     take,
     with_self_symmetry,
 )
+from bayes3d_ros.parsing.neighbour_depth import neighbour_depth
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, wrap
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.tempering import exponents
@@ -63,7 +63,7 @@ def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: N
     explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
     an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
     many = noise.p_outlier[0] > SEARCH.many_outliers
-    depth, pixel_class = jax.lax.cond(many, consensus, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
+    depth, pixel_class = jax.lax.cond(many, neighbour_depth, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
     if image.rows is not None:  # below the camera's last row the returns above it would agree on something
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth

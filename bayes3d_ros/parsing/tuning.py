@@ -24,7 +24,7 @@ class SearchTuning(NamedTuple):
     coarse_points: int = 36  # surface samples of a type; not recorded
     reach: int = 3  # cells: how far from unexplained returns an object's centre is looked for; not recorded
     nats_a_pixel: float = 8.0  # what a pixel explained is worth, roughly; not recorded
-    # Consensus of neighbours (`consensus.py`): of 40 good returns among 200 bad ones 36 points meet too few
+    # Consensus of neighbours (`neighbour_depth.py`): of 40 good returns among 200 bad ones 36 points meet too few
     many_outliers: float = 0.3  # share of the returns above which the search looks at consensus; not recorded
     consensus_reach: int = 2  # pixels; not recorded
     consensus_within: float = 0.02  # of the depth: returns of one surface; not recorded

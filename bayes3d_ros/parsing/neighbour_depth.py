@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from bayes3d_ros.parsing.tuning import SEARCH
 
 
-def consensus(
+def neighbour_depth(
     depth: Float[Array, "H W"], pixel_class: Int[Array, "H W"]
 ) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
     """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
