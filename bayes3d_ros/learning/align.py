@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.robust import geman_mcclure
-from bayes3d_ros.learning.model_constants import CORRELATED_POINTS, POINT_NOISE, POSE_PRIOR, RIM, SAME_SIDE
+from bayes3d_ros.learning.fusion_constants import CORRELATED_POINTS, POINT_NOISE, POSE_PRIOR, RIM, SAME_SIDE
 from bayes3d_ros.learning.segment import Surface, middle
 from bayes3d_ros.learning.tuning import TUNING
 

@@ -16,7 +16,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
-from bayes3d_ros.learning.model_constants import CONTRADICTED, SEEN_THROUGH
+from bayes3d_ros.learning.fusion_constants import CONTRADICTED, SEEN_THROUGH
 from bayes3d_ros.learning.segment import Surface, Thing, View, ViewError, middle, segment, surface
 from bayes3d_ros.objects.mesh_import import contact_normals
 from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.learning.model_constants import (
+from bayes3d_ros.learning.fusion_constants import (
     EDGE_SHARE,
     FEWEST_PIXELS,
     FIRM,

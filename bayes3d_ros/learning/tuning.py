@@ -2,7 +2,7 @@
 
 """What learning is tuned by: constants that change how much work makes a model, and the model but little.
 
-What changes the model stands in `model_constants.py`. "Not recorded": nobody wrote down what the value was chosen on.
+What changes the model stands in `fusion_constants.py`. "Not recorded": nobody wrote down what the value was chosen on.
 """
 
 from typing import NamedTuple

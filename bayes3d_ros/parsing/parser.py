@@ -22,8 +22,8 @@ from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.explanation import explain
-from bayes3d_ros.parsing.model_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.observe import bare_table, observe
+from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture

@@ -32,7 +32,7 @@ from bayes3d_ros.parsing.coarse_search import cell_grid
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
-from bayes3d_ros.parsing.model_constants import (
+from bayes3d_ros.parsing.posterior_constants import (
     BELOW_TABLE,
     EDGE_WIDTH,
     PLANE_TOLERANCE,

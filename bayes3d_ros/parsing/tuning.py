@@ -3,7 +3,7 @@
 """What the search and the sampler are tuned by: constants that change how much work finds the answer, and no posterior.
 
 Whatever the search finds, the sampler's weights are proper: with other values a frame takes more time, or more
-particles for the same precision. Constants that change the posterior itself stand in `model_constants.py`. "Not
+particles for the same precision. Constants that change the posterior itself stand in `posterior_constants.py`. "Not
 recorded": nobody wrote down what the value was chosen on.
 """
 

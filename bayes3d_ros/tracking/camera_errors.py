@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bayes3d_ros.parsing.smooth_errors import SmoothError
-from bayes3d_ros.tracking.model_constants import HELD_SHARE
+from bayes3d_ros.tracking.posterior_constants import HELD_SHARE
 
 _COSINES = 64  # that stand for the field; not recorded
 _FREQUENCIES = np.random.default_rng(0).normal(size=(_COSINES, 3)).astype(np.float32)

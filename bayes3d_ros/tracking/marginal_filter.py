@@ -35,7 +35,7 @@ from bayes3d_ros.sampling import student_t
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, systematic
 from bayes3d_ros.sampling.tempering import tempered
 from bayes3d_ros.tracking.depth_alignment import RENDERED, TrackedScene, aligned, information, rendered_slopes
-from bayes3d_ros.tracking.model_constants import MOTION_FREEDOM
+from bayes3d_ros.tracking.posterior_constants import MOTION_FREEDOM
 from bayes3d_ros.tracking.tuning import FILTER
 
 

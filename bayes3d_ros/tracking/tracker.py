@@ -31,7 +31,7 @@ from bayes3d_ros.tracking import marginal_filter
 from bayes3d_ros.tracking.camera_errors import pose_covariance
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.depth_alignment import TrackedScene, rendered_slopes
-from bayes3d_ros.tracking.model_constants import (
+from bayes3d_ros.tracking.posterior_constants import (
     EXPLAINED,
     NEAR_OBJECT,
     NEAR_TABLE_PLANE,

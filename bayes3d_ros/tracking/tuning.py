@@ -3,7 +3,7 @@
 """What tracking is tuned by: constants that change how much work finds the camera, and not where it is.
 
 The filter's weights are proper whatever its search finds. Constants that change the posterior stand in
-`model_constants.py`. "Not recorded": nobody wrote down what the value was chosen on.
+`posterior_constants.py`. "Not recorded": nobody wrote down what the value was chosen on.
 """
 
 from typing import NamedTuple

@@ -16,7 +16,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.search import conflicts
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006

@@ -13,7 +13,7 @@ from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likeliho
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange, sample_depth
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006

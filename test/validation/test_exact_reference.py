@@ -8,7 +8,7 @@ import pytest
 
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference import exact_reference
 from bayes3d_ros.validation.reference.exact_pairs import close_to, heaviest, true_places
 from bayes3d_ros.validation.reference.exact_reference import (

@@ -15,7 +15,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, noise_grid, sample
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.placement import log_prior, overlap
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference.calibration_problem import small_problem
 from bayes3d_ros.validation.reference.prior_predictive import (
     DepthRange,

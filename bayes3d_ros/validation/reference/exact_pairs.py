@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_weight
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.validation.reference.exact_reference import (
     BATCH,
     LEVELS,

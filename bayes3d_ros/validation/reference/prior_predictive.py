@@ -15,7 +15,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scored_image import FreePoints
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, overlap
-from bayes3d_ros.parsing.model_constants import OVERLAP_LIMIT
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 
 _BATCH, _TRIALS = 8, 200  # proposals of a scene drawn at a time; how many times
 _DEPTHS, _TAIL = 1024, 7.0  # depths of the sum, from and to so many sigma beyond what the window holds
