@@ -21,7 +21,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from bayes3d_ros.io.bags import BagDamage, BagError, RawMessage, raw_messages, topics
-from bayes3d_ros.ros.names import full_name, played
+from bayes3d_ros.ros.input_topics import full_name, played
 from bayes3d_ros.ros.spinning import shut_down, until_stopped
 from bayes3d_ros.ros.transport import use_large_messages
 

@@ -14,7 +14,7 @@ from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose, CameraPoseSo
 from bayes3d_ros.ros.diagnostics import InputView, TopicView
 from bayes3d_ros.ros.from_messages import stamp_to_ns
 from bayes3d_ros.ros.input_queue import InputQueue
-from bayes3d_ros.ros.names import DEPTH_INPUT, INFO_INPUT
+from bayes3d_ros.ros.input_topics import DEPTH_INPUT, INFO_INPUT
 from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 

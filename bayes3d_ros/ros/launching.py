@@ -25,7 +25,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.names import DEPTH_INPUT, INFO_INPUT, POSE_INPUT, full_name, played, resolved
+from bayes3d_ros.ros.input_topics import DEPTH_INPUT, INFO_INPUT, POSE_INPUT, full_name, played, resolved
 from bayes3d_ros.ros.processes import START_SECONDS
 from bayes3d_ros.ros.rviz_config import INFO_BESIDE_IMAGE, rviz_config
 from bayes3d_ros.ros.transport import chosen_transport

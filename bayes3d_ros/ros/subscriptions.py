@@ -13,7 +13,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from bayes3d_ros.ros.diagnostics import REPEAT
-from bayes3d_ros.ros.names import full_name
+from bayes3d_ros.ros.input_topics import full_name
 
 
 class AutoSubscription:

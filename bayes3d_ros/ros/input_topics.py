@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names of topics, and how ROS resolves them; without rclpy, as the launch files need them."""
+"""Topics that the nodes listen to, and how ROS resolves names of topics; without rclpy, as launch files need it."""
 
 DEPTH_INPUT, INFO_INPUT, POSE_INPUT = "depth/image_rect", "depth/camera_info", "camera_pose"  # of all three nodes
 
