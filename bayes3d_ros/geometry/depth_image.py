@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Depth images as cameras send them (raw bytes, two encodings) to and from metres; no ROS, fields come as arguments.
+"""Depth images as raw bytes to and from metres, and CameraInfo to Intrinsics; no ROS, fields come as arguments.
 
 16UC1 (also called mono16 by some drivers) holds millimetres, 0 where there is no return; 32FC1 holds metres, where NaN,
 infinity, zero and negative values are no return. In metres there is one mark for no return: NaN.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a whole parse is about."""
+"""Image, library and table: what stays the same through one parse."""
 
 from typing import NamedTuple
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the search and the sampler are tuned by: constants that change how much work finds the answer, and no posterior.
+"""The numbers of the coarse search, alignment, mixture and sampler: they change how much work finds the answer, and no
+posterior.
 
 Whatever the search finds, the sampler's weights are proper: with other values a frame takes more time, or more
 particles for the same precision. Constants that change the posterior itself stand in `posterior_constants.py`. "Not
