@@ -11,13 +11,13 @@ from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
-from bayes3d_ros.parsing.coarse_search import Evidence
+from bayes3d_ros.parsing.coarse_search import UnexplainedReturns
 from bayes3d_ros.parsing.surface_samples import in_camera, normal_motion, pixels_of
 from bayes3d_ros.parsing.tuning import SEARCH
 
 
 def align(
-    placement: Placement, evidence: Evidence, image: ScoredImage, library: LibraryArrays, table: Table
+    placement: Placement, returns: UnexplainedReturns, image: ScoredImage, library: LibraryArrays, table: Table
 ) -> tuple[Placement, Float[Array, "N 3 3"]]:
     """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over samples, per metre^2 of
     residual variance."""
@@ -27,14 +27,14 @@ def align(
         surface = in_camera(library.surface_point[placement.type], library.surface_normal[placement.type], T)
         p, n = surface
         z, u, v, seen = pixels_of(p, image)
-        observed = evidence.depth[v, u]
+        observed = returns.depth[v, u]
         q = observed[..., None] * jnp.stack([image.ray_x[u], image.ray_y[v], jnp.ones_like(observed)], -1)
         residual = (n * (q - p)).sum(-1)
         gap = jnp.abs(observed - z)
         # What faces away is not what returned, near as it may lie: a wall is thinner than the tolerance.
         facing = surface.cosine() > 0.15
         weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & facing, 1.0, 0.0)
-        weight = weight * evidence.unexplained[v, u] / geman_mcclure(residual, tolerance)
+        weight = weight * returns.unexplained[v, u] / geman_mcclure(residual, tolerance)
         J = normal_motion(surface, placement, table)
         information = jnp.einsum("np,npa,npb->nab", weight, J, J)
         # A weak pull to where the hypothesis stands: 2 cm and 0.3 rad, for directions that the data leave open.

@@ -23,7 +23,7 @@ from bayes3d_ros.parsing.tuning import SEARCH
 _CELLS_A_STEP = 4  # scored at once, beside all orientations: no result depends on it
 
 
-class Evidence(NamedTuple):
+class UnexplainedReturns(NamedTuple):
     """What is left to explain: for each pixel its depth and how unexplained its return is (1 wholly, 0 not)."""
 
     depth: Float[Array, "H W"]
@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
 
 def surface_score(
     placement: Placement,
-    evidence: Evidence,
+    returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
     table: Table,
@@ -45,7 +45,7 @@ def surface_score(
     past, relative to the reward of one that matches; the first `points` samples are used."""
     T = T_camera_object(placement, library, table)
     point, normal = _placed(T, placement.type, library, points)
-    return _score(point, normal, _area(library, points)[placement.type], evidence, image, tolerance, penalty)
+    return _score(point, normal, _area(library, points)[placement.type], returns, image, tolerance, penalty)
 
 
 class _Vectors(NamedTuple):
@@ -75,13 +75,13 @@ def _score(
     point: _Vectors,
     normal: _Vectors,
     area: Float[Array, "N"],
-    evidence: Evidence,
+    returns: UnexplainedReturns,
     image: ScoredImage,
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "N"]:
     """Rough gain in nats; `area` in metres^2 is what one of the points stands for."""
-    height, width = evidence.depth.shape
+    height, width = returns.depth.shape
     x, y, z = point
     facing = jnp.maximum(-(normal.x * x + normal.y * y + normal.z * z), 0.0) * jax.lax.rsqrt(x * x + y * y + z * z)
     inverse = 1 / jnp.maximum(z, NEAREST)
@@ -89,12 +89,12 @@ def _score(
     v = jnp.round(y * inverse * image.focal[1] + image.centre[1]).astype(jnp.int32)
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = jnp.clip(v, 0, height - 1) * width + jnp.clip(u, 0, width - 1)
-    observed = evidence.depth.ravel()[index]
+    observed = returns.depth.ravel()[index]
     # What nothing is known of neither matches nor speaks against.
     known = jnp.where(seen & (observed > 0), facing * inverse**2, 0.0)
     gap = observed - z
-    matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * evidence.unexplained.ravel()[index]
-    through = jnp.clip(gap / tolerance - 1, 0.0, 1.0) * evidence.explained.ravel()[index]
+    matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * returns.unexplained.ravel()[index]
+    through = jnp.clip(gap / tolerance - 1, 0.0, 1.0) * returns.explained.ravel()[index]
     pixels = area * image.focal[0] * image.focal[1]
     return SEARCH.nats_a_pixel * pixels * ((matched - penalty * through) * known).sum(-1)
 
@@ -105,14 +105,14 @@ def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
 
 
 def cells_to_search(
-    evidence: Evidence, image: ScoredImage, table: Table, shape: tuple[int, int]
+    returns: UnexplainedReturns, image: ScoredImage, table: Table, shape: tuple[int, int]
 ) -> tuple[Float[Array, "C 2"], Int[Array, ""]]:
     """Centres of the cells near unexplained returns, those with the most first, and how many there are."""
-    xy = table_xy(evidence.depth, image, table)
+    xy = table_xy(returns.depth, image, table)
     index = jnp.floor((xy + table.size / 2) / SEARCH.cell).astype(jnp.int32)
     inside = ((index >= 0) & (index < jnp.array(shape))).all(-1)
     index = jnp.clip(index, 0, jnp.array(shape) - 1)
-    area = jnp.where(inside & (evidence.depth > 0), evidence.unexplained, 0.0)
+    area = jnp.where(inside & (returns.depth > 0), returns.unexplained, 0.0)
     counts = jnp.zeros(shape).at[index[..., 0], index[..., 1]].add(area)
     size = 2 * SEARCH.reach + 1
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
@@ -131,14 +131,14 @@ def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Fl
 def score_cells(
     centres: Float[Array, "C 2"],
     count: Int[Array, ""],
-    evidence: Evidence,
+    returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
     """Scores of all cells, -inf where not searched: on CPUs by compiled loops."""
     if jax.default_backend() != "cpu":
-        return cells_in_turn(centres, count, evidence, image, library, table)
+        return cells_in_turn(centres, count, returns, image, library, table)
     from bayes3d_ros.parsing.coarse_search_cpu import cell_scores  # takes a while to import
 
     types, (face, yaw) = library.first.shape[0], _ways()
@@ -155,7 +155,7 @@ def score_cells(
         centres @ table.T_camera_table[:3, :2].T,
         count,
         library.num_types,
-        *evidence,
+        *returns,
         (image.focal, image.centre),
         tolerance,
         penalty,
@@ -177,7 +177,7 @@ def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
 def cells_in_turn(
     centres: Float[Array, "C 2"],
     count: Int[Array, ""],
-    evidence: Evidence,
+    returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
     table: Table,
@@ -200,7 +200,7 @@ def cells_in_turn(
             xy = jax.lax.dynamic_slice(centres, (block * _CELLS_A_STEP, 0), (_CELLS_A_STEP, 2))
             moved = (xy[:, :1] * along[0] + xy[:, 1:] * along[1])[..., None, None]
             here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
-            value = _score(here, normal, area, evidence, image, tolerance, penalty)
+            value = _score(here, normal, area, returns, image, tolerance, penalty)
             value = value.reshape(_CELLS_A_STEP, 1, NUM_FACES, SEARCH.yaws)
             return jax.lax.dynamic_update_slice(scores, value, (block * _CELLS_A_STEP, type_id, 0, 0))
 

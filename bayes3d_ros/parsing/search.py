@@ -18,7 +18,7 @@ from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, Libra
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
-    Evidence,
+    UnexplainedReturns,
     cell_grid,
     cells_to_search,
     hidden_cells,
@@ -58,7 +58,7 @@ class LeadScene(NamedTuple):
     num_objects: Int[Array, ""]
 
 
-def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: Noise) -> Evidence:
+def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: Noise) -> UnexplainedReturns:
     """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
     explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
     an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
@@ -70,7 +70,7 @@ def evidence_left(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: N
     apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
     unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)
     inside = pixel_class == IN_WORKSPACE
-    return Evidence(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
+    return UnexplainedReturns(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
 
 
 def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
@@ -105,12 +105,12 @@ def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArray
 
 
 def candidates(
-    scene: LeadScene, evidence: Evidence, context: Context, shape: tuple[int, int], overlap_limit: float
+    scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int], overlap_limit: float
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
     """The coarse levels: scored cells, the best of them aligned, near-copies and impossible ones dropped."""
     image, library, table = context
-    centres, count = cells_to_search(evidence, image, table, shape)
-    scores = score_cells(centres, count, evidence, image, library, table)
+    centres, count = cells_to_search(returns, image, table, shape)
+    scores = score_cells(centres, count, returns, image, library, table)
     types = scores.shape[1]
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
     # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
@@ -130,10 +130,10 @@ def candidates(
     face = jnp.concatenate([jnp.repeat(face, SEARCH.quarters), each_face])
     coarse = scores[cell, type_id, face, yaw]
     placement = Placement(type_id, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
-    placement, information = align(placement, evidence, image, library, table)
+    placement, information = align(placement, returns, image, library, table)
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
-    score = surface_score(placement, evidence, image, library, table, 0.01, 1.0, SURFACE_SAMPLES)
+    score = surface_score(placement, returns, image, library, table, 0.01, 1.0, SURFACE_SAMPLES)
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
@@ -167,8 +167,8 @@ def find_proposal(
     half = window // 2
     shape = cell_grid(table_size)
     depth = scene.depth[half : half + height, half : half + width]
-    evidence = evidence_left(depth, image, noise)
-    found, score = candidates(scene, evidence, context, shape, overlap_limit)
+    returns = unexplained_returns(depth, image, noise)
+    found, score = candidates(scene, returns, context, shape, overlap_limit)
     rough = _rough_gains(depth, context, noise, window)
     found, best = _starts(found, score, rough, library)
     worth = best > SEARCH.worth_nats

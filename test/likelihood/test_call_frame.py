@@ -14,7 +14,7 @@ from bayes3d_ros.likelihood.cpu import call_frame
 from bayes3d_ros.likelihood.cpu.call_frame import EXPECTED, Layout
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene, render_objects
-from bayes3d_ros.parsing.coarse_search import Evidence, cells_in_turn, score_cells
+from bayes3d_ros.parsing.coarse_search import UnexplainedReturns, cells_in_turn, score_cells
 
 NOISE, WINDOW = Noise(jnp.array([0.003]), jnp.array([0.05])), 3
 
@@ -80,9 +80,9 @@ def test_xla_scores_and_renders_where_frames_cannot_be_read(planted, scene, capl
 
 def test_the_coarse_search_goes_on_in_xla(planted, scene):
     image = scene.image(scene.depth(scene.placements((4, 0.02, -0.03, 0.4))))
-    evidence = Evidence(image.depth, jnp.ones_like(image.depth), jnp.zeros_like(image.depth))
+    returns = UnexplainedReturns(image.depth, jnp.ones_like(image.depth), jnp.zeros_like(image.depth))
     centres = jnp.asarray([[0.02, -0.03], [0.0, 0.0], [0.1, 0.1], [-0.1, 0.0]], jnp.float32)
-    given = centres, jnp.int32(4), evidence, image, scene.arrays, scene.table
+    given = centres, jnp.int32(4), returns, image, scene.arrays, scene.table
     found, expected = (np.asarray(jax.jit(lambda *a, f=f: f(*a))(*given)) for f in (score_cells, cells_in_turn))
     assert np.ptp(expected) > 10
     np.testing.assert_allclose(found, expected, rtol=1e-5)  # seen: 2.3e-6, as XLA fuses the two in its own ways

@@ -18,7 +18,7 @@ from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import array_shape, halved, padded_height, scored_image
 from bayes3d_ros.objects.placement import Placement, Table
-from bayes3d_ros.parsing.search import evidence_left
+from bayes3d_ros.parsing.search import unexplained_returns
 
 CAMERA = Intrinsics(50.0, 52.0, 20.3, 14.6, 42, 25)
 ROWS, WINDOW = CAMERA.height, 3
@@ -125,7 +125,7 @@ def test_scenes_are_rendered_and_scored_the_same(images, placements, arrays, tab
 
 def test_consensus_finds_nothing_below(images, table):
     noise = Noise(jnp.float32([0.003]), jnp.float32([0.5]))  # so many outliers that neighbours are asked
-    tight, padded = (evidence_left(image.bare_depth, image, noise) for image in (images.tight, images.padded))
+    tight, padded = (unexplained_returns(image.bare_depth, image, noise) for image in (images.tight, images.padded))
     for one, other in zip(tight, padded, strict=True):
         np.testing.assert_array_equal(one, other[:ROWS])
     assert not padded.depth[ROWS:].any()

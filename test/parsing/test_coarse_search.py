@@ -11,7 +11,7 @@ import trimesh
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.parsing.coarse_search import Evidence, cells_in_turn, score_cells
+from bayes3d_ros.parsing.coarse_search import UnexplainedReturns, cells_in_turn, score_cells
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,9 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     depth[rng.random(depth.shape) < 0.1] = 0.0
     depth[rng.random(depth.shape) < 0.1] = np.inf
     share = jnp.asarray(rng.random((2, *depth.shape)), jnp.float32)
-    evidence = Evidence(jnp.asarray(depth, jnp.float32), *share)
+    returns = UnexplainedReturns(jnp.asarray(depth, jnp.float32), *share)
     centres, given = jnp.asarray(rng.uniform(-0.4, 0.4, (16, 2)), jnp.float32), min(count, 16)
-    arguments = (centres, jnp.int32(count), evidence, image, arrays, scene.table)
+    arguments = (centres, jnp.int32(count), returns, image, arrays, scene.table)
     fast, slow = np.asarray(jax.jit(score_cells)(*arguments)), np.asarray(jax.jit(cells_in_turn)(*arguments))
     # Whole arrays work in blocks of four places.
     assert fast.shape == slow.shape and np.isneginf(fast[given:]).all() and np.isneginf(fast[:, 2:]).all()
