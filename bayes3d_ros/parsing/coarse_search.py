@@ -118,7 +118,7 @@ def cells_to_search(
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
     best, where = jax.lax.top_k(near.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
     centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * SEARCH.cell - table.size / 2
-    return centre, (best >= 8).sum()
+    return centre, (best >= SEARCH.fewest_unexplained).sum()
 
 
 def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Float[Array, "H W 2"]:

@@ -133,12 +133,14 @@ def candidates(
     placement, information = align(placement, returns, image, library, table)
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
-    score = surface_score(placement, returns, image, library, table, 0.01, 1.0, SURFACE_SAMPLES)
+    score = surface_score(
+        placement, returns, image, library, table, SEARCH.aligned_tolerance, SEARCH.aligned_penalty, SURFACE_SAMPLES
+    )
     score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    return best_first(found, _distinct(found.placement, score, (0.008, 0.1)), SEARCH.candidates)
+    return best_first(found, _distinct(found.placement, score, SEARCH.candidates_apart), SEARCH.candidates)
 
 
 def _gains(
@@ -206,7 +208,8 @@ def _starts(
     """The hypotheses to follow uphill, and the gain of the best."""
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), SEARCH.candidates)
     best = gain[0]
-    gain = _apart(found.placement, _distinct(found.placement, gain, (0.004, 0.05)), library, SEARCH.starts * 3 // 4)
+    gain = _distinct(found.placement, gain, SEARCH.starts_apart)
+    gain = _apart(found.placement, gain, library, SEARCH.starts * 3 // 4)
     found, _ = best_first(found, gain, SEARCH.starts)
     return found, best
 
@@ -225,7 +228,8 @@ def _searched(
     narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
     modes, value = narrow(narrow_key, found, rough)
     modes, value = best_first(modes, value, SEARCH.starts)
-    value = _apart(modes.placement, _distinct(modes.placement, value, (0.006, 0.15)), library, SEARCH.finalists - 1)
+    value = _distinct(modes.placement, value, SEARCH.finalists_apart)
+    value = _apart(modes.placement, value, library, SEARCH.finalists - 1)
     modes, _ = best_first(modes, value, SEARCH.finalists)
     grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
     noise, near = peak(grid_then, grid), near_peak(grid_then, grid)

@@ -24,6 +24,7 @@ class SearchTuning(NamedTuple):
     coarse_penalty: float = 0.5  # of a point seen past, relative to the reward of one that matches; not recorded
     coarse_points: int = 36  # surface samples of a type; not recorded
     reach: int = 3  # cells: how far from unexplained returns an object's centre is looked for; not recorded
+    fewest_unexplained: int = 8  # pixels of unexplained returns in reach of a cell that is searched; not recorded
     nats_a_pixel: float = 8.0  # what a pixel explained is worth, roughly; not recorded
     # Consensus of neighbours (`neighbour_depth.py`): of 40 good returns among 200 bad ones 36 points meet too few
     many_outliers: float = 0.3  # share of the returns above which the search looks at consensus; not recorded
@@ -34,8 +35,12 @@ class SearchTuning(NamedTuple):
     best_cells: int = 48  # of type, face and cell, whatever the type; not recorded
     quarters: int = 4  # of a turn: each of those at the best yaw of each; not recorded
     halves: int = 2  # of a turn: the best of every type and face in each; not recorded
+    aligned_tolerance: float = 0.01  # metres of depth, when all surface samples score what is aligned; not recorded
+    aligned_penalty: float = 1.0  # then, of a point seen past, relative to the reward of one that matches; not recorded
     candidates: int = 32  # scored with the model; not recorded
+    candidates_apart: tuple[float, float] = (0.008, 0.1)  # m, rad: of a type and face, nearer are copies; not recorded
     starts: int = 8  # followed uphill; not recorded
+    starts_apart: tuple[float, float] = (0.004, 0.05)  # m, rad, the same; not recorded
     repeated_nats: float = 4.0  # a further pose of a type at a place counts less by; mug or cup, two bricks (exactness)
     halved_from: int = 120  # pixels across: wider images are searched at half their resolution; not recorded
     least_sigma: float = 0.002  # metres: at less, candidates a pixel beside the peak score as misses; not recorded
@@ -52,6 +57,7 @@ class SearchTuning(NamedTuple):
     fit_draws: int = 24  # a mode and round, of the paraboloid; not recorded
     fit_rounds: int = 5  # not recorded
     finalists: int = 4  # modes of the mixture; not recorded
+    finalists_apart: tuple[float, float] = (0.006, 0.15)  # m, rad: of a type and face, nearer are copies; not recorded
     inflation: float = 1.5  # of a mode's covariance, as a component's; not recorded
     flatten: float = 4.0  # of the nats between modes before any pilot is drawn; not recorded
     even_share: float = 0.4  # of the first pilots, shared alike: a fit may have missed a peak that draws find
