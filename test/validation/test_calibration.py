@@ -21,9 +21,9 @@ from bayes3d_ros.validation.reference import calibration_problem
 from bayes3d_ros.validation.reference.calibration_problem import (
     SETTINGS,
     Samples,
-    log_likelihood,
-    observe,
-    render,
+    log_marginal_likelihood,
+    render_scene_depth,
+    simulate_image,
     small_problem,
 )
 from bayes3d_ros.validation.reference.prior_predictive import sample_noise, sample_scene
@@ -45,7 +45,10 @@ def from_prior(problem, rng, image, count=24):
     """The prior in place of the posterior."""
     drawn = [sample_scene(jax.random.key(int(rng.integers(2**31))), *_prior(problem)) for _ in range(count)]
     noise = np.array([sample_noise(rng, problem.grid) for _ in drawn])
-    fits = [log_likelihood(render(objects, number, problem), image, problem) for objects, number in drawn]
+    fits = [
+        log_marginal_likelihood(render_scene_depth(objects, number, problem), image, problem)
+        for objects, number in drawn
+    ]
     objects = jax.tree.map(lambda *a: np.stack(a), *(objects for objects, _ in drawn))
     numbers = np.array([number for _, number in drawn])
     return Samples(numbers, objects, noise[:, 0], noise[:, 1], np.array(fits), np.full(count, 1 / count), ())
@@ -74,17 +77,17 @@ def test_the_truth_is_scored_as_the_sampler_scores_it(problem, likelihood):
     if likelihood == "points":
         problem = small_problem(calibration_points.POINTS)
     objects, _ = sample_scene(jax.random.key(0), np.array([-np.inf, 0.0]), problem.library, problem.table)
-    surface = render(objects, 1, problem)
-    image = observe(np.random.default_rng(0), surface, (0.002, 0.1), problem)
+    surface = render_scene_depth(objects, 1, problem)
+    image = simulate_image(np.random.default_rng(0), surface, (0.002, 0.1), problem)
     assert (image.points is not None) == (likelihood == "points")
     settings = problem.settings
     context = Context(image, problem.library, problem.table)
     size = settings.table_width, settings.table_depth
     grid = for_image(problem.grid, image, settings.window)
     empty = smc.init(context, grid, settings.particles, settings.max_objects, size, settings.window)
-    bare = log_likelihood(render(objects, 0, problem), image, problem)
+    bare = log_marginal_likelihood(render_scene_depth(objects, 0, problem), image, problem)
     assert bare == pytest.approx(float(empty.log_likelihood[0]), abs=1e-3)
-    assert log_likelihood(surface, image, problem) > bare + 100
+    assert log_marginal_likelihood(surface, image, problem) > bare + 100
 
 
 def test_splines_in_sigma_are_as_good_as_many_sigmas(problem):
@@ -96,7 +99,7 @@ def test_splines_in_sigma_are_as_good_as_many_sigmas(problem):
     for k in range(12):
         rng = np.random.default_rng((100, k))
         sigma, p_outlier = sample_noise(rng, problem.grid)
-        image = observe(rng, bare, (sigma, p_outlier), problem)
+        image = simulate_image(rng, bare, (sigma, p_outlier), problem)
         u = np.linspace(*np.log([0.8 * sigma, min(1.25 * sigma, problem.settings.sigma_max)]), 200)
         values = Noise(jnp.float32(np.exp(u)), jnp.float32([p_outlier]))
         exact = np.asarray(log_likelihood_scene(scenes, image, values, window), float)[0, :, 0] + u
@@ -125,7 +128,7 @@ def test_too_small_a_sigma_is_found(problem, rows):
 
 def test_the_prior_in_place_of_the_posterior_is_found(problem, rows, monkeypatch):
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(calibration, "sample", lambda key, image, problem: from_prior(problem, rng, image))
+    monkeypatch.setattr(calibration, "run_sampler", lambda key, image, problem: from_prior(problem, rng, image))
     lazy = calibration.summary([calibration.scene_row(k, problem) for k in range(2 * FEW)])
     assert lazy["log_likelihood"]["kolmogorov"] < 1e-4
     assert lazy["sigma"]["width"] > 0.5 > calibration.summary(rows)["sigma"]["width"]

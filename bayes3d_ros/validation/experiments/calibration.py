@@ -18,10 +18,10 @@ from bayes3d_ros.validation.experiments.calibration_plot import plot
 from bayes3d_ros.validation.reference.calibration_problem import (
     CalibrationProblem,
     Samples,
-    log_likelihood,
-    observe,
-    render,
-    sample,
+    log_marginal_likelihood,
+    render_scene_depth,
+    run_sampler,
+    simulate_image,
     small_problem,
 )
 from bayes3d_ros.validation.reference.prior_predictive import sample_noise, sample_scene
@@ -69,13 +69,13 @@ def scene_row(k: int, problem: CalibrationProblem, sigma_error: float = 1.0) -> 
     rng = np.random.default_rng((SEED, k))
     objects, number = sample_scene(scene_key, problem.log_count, problem.library, problem.table)
     sigma, p_outlier = sample_noise(rng, problem.grid)
-    surface = render(objects, number, problem)
-    image = observe(rng, surface, (sigma_error * sigma, p_outlier), problem)
+    surface = render_scene_depth(objects, number, problem)
+    image = simulate_image(rng, surface, (sigma_error * sigma, p_outlier), problem)
     start = time.perf_counter()
-    samples = sample(sample_key, image, problem)
+    samples = run_sampler(sample_key, image, problem)
     seconds = time.perf_counter() - start
     truth = {"n": number, "sigma": sigma, "p_outlier": p_outlier}
-    truth["log_likelihood"] = log_likelihood(surface, image, problem)
+    truth["log_likelihood"] = log_marginal_likelihood(surface, image, problem)
     return ranked(k, truth, objects, samples, int(problem.library.num_types), rng) | {"seconds": round(seconds, 3)}
 
 

@@ -112,15 +112,17 @@ def _table_size(settings: ParserSettings) -> tuple[float, float]:
     return settings.table_width, settings.table_depth
 
 
-def render(objects: Placement, number: int, problem: CalibrationProblem) -> Float[np.ndarray, "H W"]:
+def render_scene_depth(objects: Placement, number: int, problem: CalibrationProblem) -> Float[np.ndarray, "H W"]:
     """Depth of the first `number` of objects [M] on the table, as the sampler draws it."""
     half, (height, width) = problem.settings.window // 2, problem.blank.depth.shape
-    padded = _render(objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window)
+    padded = _render_scene_depth(
+        objects, jnp.int32(number), problem.blank, problem.library, problem.table, problem.settings.window
+    )
     return np.asarray(padded)[half : half + height, half : half + width]
 
 
 @partial(jax.jit, static_argnames="window")
-def _render(
+def _render_scene_depth(
     objects: Placement, number: Int[Array, ""], blank: ScoredImage, library: LibraryArrays, table: Table, window: int
 ) -> Float[Array, "Hp Wp"]:
     scenes = pad_scene(blank.bare_depth, window)[None]
@@ -131,7 +133,7 @@ def _render(
     return scenes[0]
 
 
-def observe(
+def simulate_image(
     rng: np.random.Generator, surface: Float[np.ndarray, "H W"], noise: tuple[float, float], problem: CalibrationProblem
 ) -> ScoredImage:
     """What the likelihood is a density of, given rendered depth and noise (sigma, p_outlier): an image of which every
@@ -147,15 +149,19 @@ def observe(
     return problem.blank._replace(depth=jnp.asarray(depth, jnp.float32))
 
 
-def log_likelihood(surface: Float[np.ndarray, "H W"], image: ScoredImage, problem: CalibrationProblem) -> float:
+def log_marginal_likelihood(
+    surface: Float[np.ndarray, "H W"], image: ScoredImage, problem: CalibrationProblem
+) -> float:
     """log p(image | rendered depth), noise integrated out, with the constant of `Samples`."""
     window = problem.settings.window
     grid = noise_marginal.for_image(problem.grid, image, window)
-    return float(_log_likelihood(jnp.asarray(surface), image, grid, window))
+    return float(_log_marginal_likelihood(jnp.asarray(surface), image, grid, window))
 
 
 @partial(jax.jit, static_argnames="window")
-def _log_likelihood(surface: Float[Array, "H W"], image: ScoredImage, grid: NoiseGrid, window: int) -> Float[Array, ""]:
+def _log_marginal_likelihood(
+    surface: Float[Array, "H W"], image: ScoredImage, grid: NoiseGrid, window: int
+) -> Float[Array, ""]:
     scenes = pad_scene(jnp.stack([image.bare_depth, surface]), window)
     empty, loglik_grid = log_likelihood_scene(scenes, image, grid.coarse, window)
     return noise_marginal.log_marginal((loglik_grid - empty.max())[None], grid)[0]
@@ -164,7 +170,7 @@ def _log_likelihood(surface: Float[Array, "H W"], image: ScoredImage, grid: Nois
 _sample_noise = jax.jit(noise_marginal.sample)
 
 
-def sample(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProblem) -> Samples:
+def run_sampler(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProblem) -> Samples:
     """The posterior given an image: every stage of the sampler, of weight P(n) Z_n."""
     settings, context = problem.settings, Context(image, problem.library, problem.table)
     grid = noise_marginal.for_image(problem.grid, image, settings.window)
