@@ -22,7 +22,7 @@ from bayes3d_ros.objects.mesh_import import contact_normals
 from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel
 from bayes3d_ros.settings import LearnerSettings
 
-MOST_VIEWS = 10
+MOST_VIEWS_A_MODEL = 10
 
 
 class LearningError(Exception):
@@ -55,8 +55,8 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
     its origin at the centre of its box's base. Raises LearningError with one line where none can be made."""
     settings = settings or LearnerSettings()
     check_name(name)
-    if not 1 <= len(frames) <= MOST_VIEWS:
-        raise LearningError(f"expected 1 to {MOST_VIEWS} views, got {len(frames)}")
+    if not 1 <= len(frames) <= MOST_VIEWS_A_MODEL:
+        raise LearningError(f"expected 1 to {MOST_VIEWS_A_MODEL} views, got {len(frames)}")
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
         parts = list(pool.map(lambda frame: _segmented(frame, settings), frames))
         views = {k: part for k, part in enumerate(parts) if isinstance(part, View)}

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.captures import CaptureError, CaptureStore
 from bayes3d_ros.learning.learn import (
-    MOST_VIEWS,
+    MOST_VIEWS_A_MODEL,
     Learned,
     LearningError,
     choose_thing,
@@ -115,7 +115,7 @@ class ObjectLearnerNode(Node):
     def _capture(self) -> str:
         store, settings = self._store(), self._read(LearnerSettings)
         seen = self._captured(store, settings)
-        if len(seen) >= MOST_VIEWS:
+        if len(seen) >= MOST_VIEWS_A_MODEL:
             raise Refusal(f"{len(seen)} views are captured already, more would not be used: build or reset")
         frame = self._newest_frame()
         if frame.stamp_ns in seen:
@@ -139,7 +139,7 @@ class ObjectLearnerNode(Node):
             raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
         replace = self._may_replace(store.folder.name, {frame.stamp_ns for frame in frames})
         self.get_logger().info(f"building {store.folder.name} from {len(frames)} view{'s' * (len(frames) != 1)}")
-        learned = learn(frames[:MOST_VIEWS], store.folder.name, settings)
+        learned = learn(frames[:MOST_VIEWS_A_MODEL], store.folder.name, settings)
         path = save_model(learned.model, self._library(), replace=replace)
         self._publish(learned, frames[-1].stamp_ns)
         used = sum(not view.refused for view in learned.views)

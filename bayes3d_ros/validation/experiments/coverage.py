@@ -51,7 +51,7 @@ NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
 COVERED_TYPES: tuple[str, ...] = tuple(SYMMETRIES)
 COVERAGE_SCENES, QUICK_COVERAGE_SCENES = 400, 40
 SAME_THING_WITHIN = 0.1  # metres: an estimate farther off is another thing's
-SAME_REST = np.radians(10.0)  # samples tipped farther stand on another face
+RIGHT_REST_WITHIN = np.radians(10.0)  # samples tipped farther stand on another face
 # Quantities: x and y on the table; `range` and `across`, the same along and across the camera's view; then regions.
 COVERED_QUANTITIES = ("x", "y", "range", "across", "yaw", "position", "pose")
 HEADER = (
@@ -163,7 +163,7 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
     return {
         "probability": round(float(total), 6),
         "samples_ess": round(float(1 / (weights**2).sum()), 2),
-        "right_rest": round(float(weights[tilt < SAME_REST].sum()), 5),
+        "right_rest": round(float(weights[tilt < RIGHT_REST_WITHIN].sum()), 5),
         **{name: {key: round(v, 8) for key, v in said._asdict().items()} for name, said in found.items()},
     }
 

@@ -25,7 +25,11 @@ VIEW_PITCHES = (30.0, 60.0)  # of the camera, degrees downwards
 AIM = 0.06  # metres by which it looks past the object, a standard deviation; the object is in view all the same
 IMAGE_BIAS, OBJECT_BIAS = (0.0, 0.002), 0.002  # metres; see SensorNoise
 WAVINESS, WAVINESS_LENGTH = (0.001, 0.002), (0.03, 0.1)  # metres, a standard deviation and a length
-_BORDER, _MOST_VIEWS, _SAME_REST = 8, 1000, np.radians(1.0)
+_BORDER, _VIEW_TRIALS, _CONTACT_WITHIN = (
+    8,
+    1000,
+    np.radians(1.0),
+)  # pixels; cameras drawn at most; a facet off its contact
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ def resting_object(name: str, mesh: trimesh.Trimesh, contacts: Float[np.ndarray,
     downs, _ = resting_normals(mesh)
     if contacts is not None:
         cosine = downs @ (contacts / np.linalg.norm(contacts, axis=1, keepdims=True)).T
-        downs = downs[np.unique(cosine.argmax(0)[cosine.max(0) > np.cos(_SAME_REST)])]
+        downs = downs[np.unique(cosine.argmax(0)[cosine.max(0) > np.cos(_CONTACT_WITHIN)])]
     if len(downs) == 0:
         raise SimulationError(f"{name}: expected a stable facet to rest on, found none")
     return RestingObject(name, mesh, downs, RayCaster([(mesh, np.eye(4))]))
@@ -113,7 +117,7 @@ def _view(
     """T_table_camera of a random camera that has all of the object in view."""
     points = mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
     middle = (points.min(0) + points.max(0)) / 2
-    for _ in range(_MOST_VIEWS):
+    for _ in range(_VIEW_TRIALS):
         distance, pitch = rng.uniform(*VIEW_DISTANCES), np.radians(rng.uniform(*VIEW_PITCHES))
         azimuth = rng.uniform(0, 2 * np.pi)
         target = middle + np.append(rng.normal(0, AIM, 2), 0)
