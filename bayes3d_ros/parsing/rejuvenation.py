@@ -43,7 +43,7 @@ class WeightedScenes(NamedTuple):
     log_weight: Float[Array, "N"]  # normalised
 
 
-class Frame(NamedTuple):
+class GivenFrame(NamedTuple):
     """What is fixed while a frame is parsed."""
 
     context: Context
@@ -60,7 +60,12 @@ class Effort(NamedTuple):
 
 
 def rejuvenate(
-    key: PRNGKeyArray, state: WeightedScenes, proposals: Proposal, count: Int[Array, ""], frame: Frame, effort: Effort
+    key: PRNGKeyArray,
+    state: WeightedScenes,
+    proposals: Proposal,
+    count: Int[Array, ""],
+    frame: GivenFrame,
+    effort: Effort,
 ) -> WeightedScenes:
     """Move as many objects as there are turns: first that of which the fewest placements are left, then the others;
     proposals [M], of each slot's stage."""
@@ -86,7 +91,7 @@ def _move(
     m: Int[Array, ""],
     proposal: Proposal,
     count: Int[Array, ""],
-    frame: Frame,
+    frame: GivenFrame,
     heats: Int[Array, ""],
 ) -> WeightedScenes:
     """The object in slot m of every scene."""
@@ -137,7 +142,7 @@ def _move(
 
 
 def _scenes_without(
-    state: WeightedScenes, m: Int[Array, ""], count: Int[Array, ""], frame: Frame
+    state: WeightedScenes, m: Int[Array, ""], count: Int[Array, ""], frame: GivenFrame
 ) -> Float[Array, "N Hp Wp"]:
     """Padded depth of the scenes without the object in slot m."""
 
@@ -156,7 +161,7 @@ def _heat_and_cool(
     extend: Callable[[Int[Array, "N"], Placement], Proposed],
     proposal: Proposal,
     heats: Int[Array, ""],
-    frame: Frame,
+    frame: GivenFrame,
 ) -> tuple[Proposed, Float[Array, "N"]]:
     """From weighted draws of the target, down to the least exponent and up again, to others with their log weights."""
     _, library, table = frame.context

@@ -34,7 +34,7 @@ from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
-from bayes3d_ros.parsing.rejuvenation import Effort, Frame, WeightedScenes, rejuvenate
+from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
@@ -175,7 +175,7 @@ def refresh(
 ) -> Population:
     """The same posterior of scenes of `count` objects, some of them moved."""
     scenes = WeightedScenes(*(getattr(state, name) for name in WeightedScenes._fields))
-    frame = Frame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
+    frame = GivenFrame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 
