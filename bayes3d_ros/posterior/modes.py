@@ -26,7 +26,7 @@ NEIGHBOURS = 8.0  # effective samples within a kernel's width, but no more than 
 SHARE = 1 / 6  # ... this share of the weight: six single poses may be six modes
 SPARSE = 0.2  # share of the weight that may have fewer neighbours
 NEGLIGIBLE_SHARE = 0.02  # weight of a mode that is not worth listing
-DENSE = 0.5  # the middle of a mode lies where it is at least this much as dense as at its peak
+DENSE = 0.5  # the medoid of a mode lies where it is at least this much as dense as at its peak
 MOST_NODES = 256  # more poses than this are represented by the so many that cover them best
 
 
@@ -128,7 +128,7 @@ def _follow(peak: list[int], node: int) -> int:
     return node
 
 
-def middle(nodes: Nodes) -> int:
+def medoid(nodes: Nodes) -> int:
     """The pose with the smallest mean squared distance from all, of those where they lie densely."""
     kernel = np.exp(-nodes.distance2 / (2 * kernel_width(nodes) ** 2))
     density, spread = (np.einsum("ij,j->i", pairs, nodes.weight) for pairs in (kernel, nodes.distance2))

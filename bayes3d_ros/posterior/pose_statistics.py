@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.posterior.modes import middle, mode_labels, nodes
+from bayes3d_ros.posterior.modes import medoid, mode_labels, nodes
 from bayes3d_ros.posterior.types import PoseMode
 
 LOCAL_ANGLE = np.radians(20.0)  # a mode's pose is a mean over its poses within this ...
-LOCAL_DISTANCE = 0.05  # ... and this, in metres, of its middle
+LOCAL_DISTANCE = 0.05  # ... and this, in metres, of its medoid
 
 
 class PoseStatistics(NamedTuple):
@@ -68,12 +68,12 @@ def pose_mode(
     """One mode of these poses, of weight sum(weights).
 
     Its pose is their mean (on SO(3) for the rotation) where all are close together. Along an arc or a ring the mean of
-    all may be far from every one: there it is the mean of those near the middle. The covariance is the second moment of
+    all may be far from every one: there it is the mean of those near the medoid. The covariance is the second moment of
     all about that pose.
     """
     local = _near(position, quaternion, int(np.argmax(weights)))
     if not local.all():
-        local = _near(position, quaternion, middle(nodes(position, quaternion, weights)))
+        local = _near(position, quaternion, medoid(nodes(position, quaternion, weights)))
     inside = weights[local] / weights[local].sum()
     mean_position, mean_rotation = inside @ position[local], rotation_mean(quaternion[local], inside)
     return PoseMode(
