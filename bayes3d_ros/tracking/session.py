@@ -45,7 +45,8 @@ class CameraFollower:
             if not estimate.lost:
                 return now, estimate
         try:
-            now, estimate = self.tracker.step(self.tracker.relocalise(known, self.parser.parse(frame), frame), frame)
+            found = self.tracker.find_by_parsed_scene(known, self.parser.parse(frame), frame)
+            now, estimate = self.tracker.step(found, frame)
         except (TrackingError, ParseError):
             if self._told is None:
                 raise

@@ -163,7 +163,7 @@ class CameraTracker:
             return f"the image is explained better by nothing in sight (log evidence {estimate.log_evidence:.0f})"
         return ""
 
-    def relocalise(self, known: Tracking, posterior: ScenePosterior, frame: DepthFrame) -> Tracking:
+    def find_by_parsed_scene(self, known: Tracking, posterior: ScenePosterior, frame: DepthFrame) -> Tracking:
         """The camera where a parsed scene of this frame says, in the same world: the likeliest of all poses that put a
         parsed object on a known one of its type. Raises TrackingError where there is none."""
         suggested = list(_suggested(known.world, posterior))

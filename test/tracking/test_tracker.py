@@ -268,7 +268,7 @@ def test_what_cannot_be_tracked_is_refused_in_a_line(tracker, world, frame):
     with pytest.raises(TrackingError, match="no return between 0.1 and 5.0 m"):
         tracker.step(known, blank)
     with pytest.raises(TrackingError, match="expected one of thing in sight, found no object"):
-        tracker.relocalise(known, SimpleNamespace(objects=()), blank)
+        tracker.find_by_parsed_scene(known, SimpleNamespace(objects=()), blank)
 
 
 def test_a_motion_is_scaled_with_the_time_between_frames():
