@@ -177,11 +177,11 @@ class SceneParser:
         error, window = self._smooth_error, self.settings.window
         offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
         height, tilt = jnp.float32(self.settings.table_height_sigma), jnp.float32(self.settings.table_tilt_sigma)
-        plane = self._draw_table_errors(jax.random.fold_in(key, 2), len(state.log_weight), height, tilt)
-        objects, offset, plane, log_weight, noise, log_evidence = jax.device_get(
-            (state.objects, offset, plane, state.log_weight, noise, state.log_evidence)
+        table_error = self._draw_table_errors(jax.random.fold_in(key, 2), len(state.log_weight), height, tilt)
+        objects, offset, table_error, log_weight, noise, log_evidence = jax.device_get(
+            (state.objects, offset, table_error, state.log_weight, noise, state.log_evidence)
         )
-        return Stage(objects, offset, plane, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
+        return Stage(objects, offset, table_error, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
 
     def _mix(self, stages: list[Stage], table: Table) -> tuple[SceneSamples, float]:
         """The mixture over the number of objects, and log p(image) - log p(image | empty)."""

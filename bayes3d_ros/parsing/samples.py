@@ -23,7 +23,7 @@ class Stage(NamedTuple):
 
     objects: Placement
     offset: Float[np.ndarray, "N M 3"]  # of each object against its picture: x, y, yaw
-    plane: Float[np.ndarray, "N 3"]  # the table against the plane taken for it: two tilts, height
+    table_error: Float[np.ndarray, "N 3"]  # the table against the plane taken for it: two tilts, height
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
@@ -35,8 +35,8 @@ class Stage(NamedTuple):
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        offset, plane = np.zeros((0, slots, 3), np.float32), np.zeros((0, 3), np.float32)
-        return cls(objects, offset, plane, zero, zero, zero, log_evidence)
+        offset, table_error = np.zeros((0, slots, 3), np.float32), np.zeros((0, 3), np.float32)
+        return cls(objects, offset, table_error, zero, zero, zero, log_evidence)
 
 
 def mixture(
@@ -55,16 +55,16 @@ def mixture(
     keep = np.flatnonzero(log_weight > LEAST_LOG_WEIGHT)
     objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
     offset = np.concatenate([s.offset for s in stages])[keep]
-    plane = np.concatenate([s.plane for s in stages])[keep]
-    if offset.any() or plane.any():  # each scene twice, with errors of either sign: means stay where they are
+    table_error = np.concatenate([s.table_error for s in stages])[keep]
+    if offset.any() or table_error.any():  # each scene twice, with errors of either sign: means stay where they are
         sign = np.resize([1.0, -1.0], 2 * len(keep))
         keep, offset = np.repeat(keep, 2), np.repeat(offset, 2, 0) * sign[:, None, None]
-        plane = np.repeat(plane, 2, 0) * sign[:, None]
+        table_error = np.repeat(table_error, 2, 0) * sign[:, None]
         objects = jax.tree.map(lambda a: np.repeat(a, 2, 0), objects)
         x, y, yaw = objects.x + offset[..., 0], objects.y + offset[..., 1], objects.yaw + offset[..., 2]
         objects = objects._replace(x=x, y=y, yaw=np.mod(yaw, 2 * np.pi))
     held = np.arange(objects.type.shape[1]) < n[keep, None]
-    T = _T_camera_object(objects, library, table, plane)
+    T = _T_camera_object(objects, library, table, table_error)
     quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
     samples = SceneSamples(
         log_weight=(log_weight[keep] - np.logaddexp.reduce(log_weight[keep])).astype(np.float32),
@@ -80,12 +80,12 @@ def mixture(
 
 
 def _T_camera_object(
-    objects: Placement, library: LibraryArrays, table: Table, plane: Float[np.ndarray, "S 3"]
+    objects: Placement, library: LibraryArrays, table: Table, table_error: Float[np.ndarray, "S 3"]
 ) -> Float[np.ndarray, "S M 4 4"]:
     """In float64 numpy: sample counts differ from frame to frame, and must not recompile."""
     T_contact = np.asarray(library.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
-    moved = np.broadcast_to(np.eye(4), (len(plane), 1, 4, 4)).copy()
-    moved[:, 0, :3, :3] = Rotation.from_rotvec(plane * [1, 1, 0]).as_matrix()
-    moved[:, 0, 2, 3] = plane[:, 2]
+    moved = np.broadcast_to(np.eye(4), (len(table_error), 1, 4, 4)).copy()
+    moved[:, 0, :3, :3] = Rotation.from_rotvec(table_error * [1, 1, 0]).as_matrix()
+    moved[:, 0, 2, 3] = table_error[:, 2]
     along = slide(*(np.asarray(a) for a in (objects.x, objects.y, objects.yaw)))
     return np.asarray(table.T_camera_table, np.float64) @ moved @ along @ T_contact
