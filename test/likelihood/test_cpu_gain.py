@@ -40,7 +40,7 @@ def hypotheses(arrays):
 
 @pytest.fixture(scope="module")
 def marched(hypotheses, image, arrays):
-    """Depth of the pairs by the walk of rendering/."""
+    """Depth of the pairs by the walk of `march.py`."""
     shape = (HEIGHT, WIDTH, COUNT)
     rays = tuple(jnp.broadcast_to(a, shape) for a in (image.ray_x[:, None], image.ray_y[:, None, None]))
     each = [march(arrays, hypotheses.type[:, k], hypotheses.T_camera_object[:, k], rays) for k in range(2)]
