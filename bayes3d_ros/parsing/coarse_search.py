@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -29,6 +29,14 @@ class UnexplainedReturns(NamedTuple):
     depth: Float[Array, "H W"]
     unexplained: Float[Array, "H W"]
     explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
+
+
+class Cells(NamedTuple):
+    """Places on the table where an object's centre is looked for; the first `searched` of them."""
+
+    centre: Float[Array, "C 2"]  # metres, in the table's frame
+    distance: Float[Array, "C"]  # metres, to the nearest unexplained returns
+    searched: Int[Array, ""]
 
 
 def surface_score(
@@ -105,20 +113,40 @@ def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
 
 
 def cells_to_search(
-    returns: UnexplainedReturns, image: ScoredImage, table: Table, shape: tuple[int, int]
-) -> tuple[Float[Array, "C 2"], Int[Array, ""]]:
-    """Centres of the cells near unexplained returns, those with the most first, and how many there are."""
+    returns: UnexplainedReturns, library: LibraryArrays, image: ScoredImage, table: Table, shape: tuple[int, int]
+) -> Cells:
+    """The cells that an object's centre may be in, given that it shows one of the unexplained returns: those nearest to
+    the returns first."""
     xy = table_xy(returns.depth, image, table)
     index = jnp.floor((xy + table.size / 2) / SEARCH.cell).astype(jnp.int32)
     inside = ((index >= 0) & (index < jnp.array(shape))).all(-1)
     index = jnp.clip(index, 0, jnp.array(shape) - 1)
     area = jnp.where(inside & (returns.depth > 0), returns.unexplained, 0.0)
     counts = jnp.zeros(shape).at[index[..., 0], index[..., 1]].add(area)
-    size = 2 * SEARCH.reach + 1
+    size = 2 * SEARCH.gathered + 1
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
-    best, where = jax.lax.top_k(near.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
+    apart = _distance((counts > 0) & (near >= SEARCH.fewest_unexplained))
+    # Those with the most returns first where the distance is the same.
+    order = -apart + jnp.minimum(near, 1e3) * 1e-5
+    best, where = jax.lax.top_k(order.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
     centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * SEARCH.cell - table.size / 2
-    return centre, (best >= SEARCH.fewest_unexplained).sum()
+    distance = apart.ravel()[where]
+    real = (jnp.arange(library.first.shape[0]) < library.num_types)[:, None]
+    farthest = jnp.where(real, reach(library), 0.0).max()
+    return Cells(centre, distance, (distance <= farthest).sum())
+
+
+def reach(library: LibraryArrays) -> Float[Array, "K 6"]:
+    """How far from one of its returns, along the table, the centre of an object may be, in metres: half a diagonal of
+    the face that it stands on, and what the corners of two cells add."""
+    return 0.5 * jnp.linalg.norm(library.face_size, axis=-1) + 2**0.5 * SEARCH.cell
+
+
+def _distance(source: Bool[Array, "X Y"]) -> Float[Array, "X Y"]:
+    """Of every cell to the nearest source, in metres; inf where there is none."""
+    x, y = (jnp.arange(n, dtype=jnp.float32) for n in source.shape)
+    along_x = jnp.where(source, (x[:, None] - x)[..., None] ** 2, jnp.inf).min(1)
+    return SEARCH.cell * jnp.sqrt((along_x[:, None, :] + (y[:, None] - y) ** 2).min(-1))
 
 
 def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Float[Array, "H W 2"]:
@@ -129,16 +157,15 @@ def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Fl
 
 
 def score_cells(
-    centres: Float[Array, "C 2"],
-    count: Int[Array, ""],
+    cells: Cells,
     returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Scores of all cells, -inf where not searched: on CPUs by compiled loops."""
+    """Scores of the cells in reach of each type and face, -inf elsewhere: on CPUs by compiled loops."""
     if jax.default_backend() != "cpu":
-        return cells_in_turn(centres, count, returns, image, library, table)
+        return cells_in_turn(cells, returns, image, library, table)
     from bayes3d_ros.parsing.coarse_search_cpu import cell_scores  # takes a while to import
 
     types, (face, yaw) = library.first.shape[0], _ways()
@@ -152,8 +179,9 @@ def score_cells(
         point,
         normal,
         SEARCH.nats_a_pixel * _area(library, points) * image.focal[0] * image.focal[1],
-        centres @ table.T_camera_table[:3, :2].T,
-        count,
+        cells.centre @ table.T_camera_table[:3, :2].T,
+        (cells.distance, jnp.repeat(reach(library), SEARCH.yaws, 1)),
+        cells.searched,
         library.num_types,
         *returns,
         (image.focal, image.centre),
@@ -175,18 +203,18 @@ def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
 
 
 def cells_in_turn(
-    centres: Float[Array, "C 2"],
-    count: Int[Array, ""],
+    cells: Cells,
     returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
-    """Scores of all cells, -inf where not searched. The loop runs over real cells and real types only."""
+    """Scores of the cells in reach of each type and face, -inf elsewhere. The loop runs over real cells and real
+    types only."""
     types, (face, yaw) = library.first.shape[0], _ways()
     ways = NUM_FACES * SEARCH.yaws
     tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points
-    blocks = -(-count // _CELLS_A_STEP)
+    blocks = -(-cells.searched // _CELLS_A_STEP)
     along = [table.T_camera_table[:3, axis] for axis in range(2)]
 
     def of_type(type_id: Int[Array, ""], scores: Array) -> Array:
@@ -197,7 +225,7 @@ def cells_in_turn(
         area = _area(library, points)[type_id]
 
         def of_block(block: Int[Array, ""], scores: Array) -> Array:
-            xy = jax.lax.dynamic_slice(centres, (block * _CELLS_A_STEP, 0), (_CELLS_A_STEP, 2))
+            xy = jax.lax.dynamic_slice(cells.centre, (block * _CELLS_A_STEP, 0), (_CELLS_A_STEP, 2))
             moved = (xy[:, :1] * along[0] + xy[:, 1:] * along[1])[..., None, None]
             here = _Vectors(*(p + moved[:, a] for a, p in enumerate(point)))
             value = _score(here, normal, area, returns, image, tolerance, penalty)
@@ -206,8 +234,10 @@ def cells_in_turn(
 
         return jax.lax.fori_loop(0, blocks, of_block, scores)
 
-    scores = jnp.full((centres.shape[0], types, NUM_FACES, SEARCH.yaws), -jnp.inf)
-    return jax.lax.fori_loop(0, library.num_types, of_type, scores)
+    scores = jnp.full((cells.centre.shape[0], types, NUM_FACES, SEARCH.yaws), -jnp.inf)
+    scores = jax.lax.fori_loop(0, library.num_types, of_type, scores)
+    near = cells.distance[:, None, None] <= reach(library)
+    return jnp.where(near[..., None], scores, -jnp.inf)
 
 
 def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:

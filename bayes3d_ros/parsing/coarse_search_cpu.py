@@ -24,6 +24,7 @@ def cell_scores(
     normal: Float[Array, "3 K Y P"],
     worth: Float[Array, "K"],
     moved: Float[Array, "C 3"],
+    distance_and_reach: tuple[Float[Array, "C"], Float[Array, "K Y"]],
     count: Int[Array, ""],
     num_types: Int[Array, ""],
     depth: Float[Array, "H W"],
@@ -33,13 +34,15 @@ def cell_scores(
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "C K Y"]:
-    """Scores of surface samples of Y orientations of each type, moved to each of the first `count` places, -inf for
-    other places and types. `worth` is what a point explained is worth at 1 m; `camera` is focal length and centre."""
+    """Scores of surface samples of Y orientations of each type, moved to each of the first `count` places whose
+    distance is within the orientation's reach, -inf for other places and types. `worth` is what a point explained is
+    worth at 1 m; `camera` is focal length and centre. Reach is the same for each eight orientations in turn."""
     known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST_M), 0.0, _FARTHEST_M)
     focal, centre = camera
     inputs = (
         *(a.astype(jnp.float32).ravel() for a in (point, normal, worth, moved, known, unexplained, explained)),
         jnp.stack([*focal, *centre, *jnp.float32([tolerance, penalty])]),
+        *(a.astype(jnp.float32).ravel() for a in distance_and_reach),
         jnp.stack([*jnp.int32([*depth.shape, *point.shape[1:]]), count, num_types]).astype(jnp.int32),
     )
     result = jax.ShapeDtypeStruct((moved.shape[0], *point.shape[1:3]), jnp.float32)
@@ -139,7 +142,7 @@ def _sum(area, first, count):
 
 
 @fast
-def _score(point, normal, worth, moved, image, types, ways, size, count, num_types, points, scores):
+def _score(point, normal, worth, moved, distance, reach, image, types, ways, size, count, num_types, points, scores):
     for k in range(u64(len(scores))):
         scores[k] = f32(-np.inf)
     stride = types * ways * size
@@ -148,6 +151,8 @@ def _score(point, normal, worth, moved, image, types, ways, size, count, num_typ
             some = min(_ORIENTATIONS_AT_ONCE, ways - way)
             first, full = (type_id * ways + way) * size, some * size
             for place in range(count):
+                if distance[place] > reach[type_id * ways + way]:
+                    continue
                 _project(
                     point, normal, first, full, stride, moved[3 * place], moved[3 * place + 1], moved[3 * place + 2],
                     image, points,
@@ -164,15 +169,15 @@ def _cell_scores(frame):
     """See `cell_scores`."""
     if answered_version(frame):
         return 0
-    numbers, sizes = floats(frame, 7), integers(frame, 8)
-    places, types = min(sizes[5], i32(len(floats(frame, 3)) // 3)), min(sizes[6], sizes[2])
+    numbers, sizes = floats(frame, 7), integers(frame, 10)
+    places, types = min(sizes[5], i32(len(floats(frame, 8)))), min(sizes[6], sizes[2])
     image = _Image(
         floats(frame, 4), floats(frame, 5), floats(frame, 6), sizes[0], sizes[1],
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
     _score(
-        floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), image, np.int64(sizes[2]),
-        np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(types),
+        floats(frame, 0), floats(frame, 1), floats(frame, 2), floats(frame, 3), floats(frame, 8), floats(frame, 9),
+        image, np.int64(sizes[2]), np.int64(sizes[3]), np.int64(sizes[4]), np.int64(places), np.int64(types),
         _new_points(_ORIENTATIONS_AT_ONCE * sizes[4]), float_results(frame, 0),
     )  # fmt: skip
     return 0

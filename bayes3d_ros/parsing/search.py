@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal, near_peak, peak
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene
-from bayes3d_ros.likelihood.scored_image import ScoredImage, halved
+from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
+from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, log_prior, overlap
 from bayes3d_ros.parsing.alignment import align
@@ -104,32 +104,44 @@ def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArray
     return jnp.where(before.sum(1) < most, score, score - _CROWDED_OUT_NATS)
 
 
+def _best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int, most_types: int) -> Bool[Array, "N"]:
+    """Which are among the `each` best of their type, for the `most_types` types whose best are best. What explains a
+    few returns best may be any type, and many poses of one must not crowd out the others."""
+    better = (score[:, None] < score) | ((score[:, None] == score) & jnp.tril(jnp.ones((len(score),) * 2, bool), -1))
+    same = type_id[:, None] == type_id
+    best_of_type = ~(better & same).any(1)
+    types_before = (better & best_of_type).sum(1)  # of a type's best: how many other types are better
+    rank_of_type = jnp.where(same & best_of_type, types_before, 0).sum(1)
+    return jnp.isfinite(score) & ((better & same).sum(1) < each) & (rank_of_type < most_types)
+
+
 def candidates(
     scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int], overlap_limit: float
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
     """The coarse levels: scored cells, the best of them aligned, near-copies and impossible ones dropped."""
     image, library, table = context
-    centres, count = cells_to_search(returns, image, table, shape)
-    scores = score_cells(centres, count, returns, image, library, table)
+    cells = cells_to_search(returns, library, image, table, shape)
+    scores = score_cells(cells, returns, image, library, table)
     types = scores.shape[1]
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
     # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
     # another.
     _, index = jax.lax.top_k(scores.max(-1).ravel(), SEARCH.best_cells)
-    half = SEARCH.yaws // SEARCH.halves
-    per_face = scores.reshape(-1, types, NUM_FACES, SEARCH.halves, half).transpose(1, 2, 3, 0, 4)
-    per_face = per_face.reshape(types * NUM_FACES * SEARCH.halves, -1)
+    part = SEARCH.yaws // SEARCH.quarters
+    per_face = scores.reshape(-1, types, NUM_FACES, SEARCH.quarters, part).transpose(1, 2, 3, 0, 4)
+    per_face = per_face.reshape(types * NUM_FACES * SEARCH.quarters, -1)
     cell, type_id, face = index // (types * NUM_FACES), index // NUM_FACES % types, index % NUM_FACES
     quarter = jnp.argmax(scores[cell, type_id, face].reshape(SEARCH.best_cells, SEARCH.quarters, -1), -1)
-    quarter = quarter + jnp.arange(SEARCH.quarters) * (SEARCH.yaws // SEARCH.quarters)
+    quarter = quarter + jnp.arange(SEARCH.quarters) * part
     first = jnp.argmax(per_face, 1)
-    each_type, each_face, each_half = (a.ravel() for a in jnp.indices((types, NUM_FACES, SEARCH.halves)))
-    yaw = jnp.concatenate([quarter.ravel(), each_half * half + first % half])
-    cell = jnp.concatenate([jnp.repeat(cell, SEARCH.quarters), first // half])
+    each_type, each_face, each_part = (a.ravel() for a in jnp.indices((types, NUM_FACES, SEARCH.quarters)))
+    yaw = jnp.concatenate([quarter.ravel(), each_part * part + first % part])
+    cell = jnp.concatenate([jnp.repeat(cell, SEARCH.quarters), first // part])
     type_id = jnp.concatenate([jnp.repeat(type_id, SEARCH.quarters), each_type])
     face = jnp.concatenate([jnp.repeat(face, SEARCH.quarters), each_face])
     coarse = scores[cell, type_id, face, yaw]
-    placement = Placement(type_id, face, centres[cell, 0], centres[cell, 1], (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
+    x, y = cells.centre[cell].T
+    placement = Placement(type_id, face, x, y, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
     placement, information = align(placement, returns, image, library, table)
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
@@ -140,7 +152,9 @@ def candidates(
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    return best_first(found, _distinct(found.placement, score, SEARCH.candidates_apart), SEARCH.candidates)
+    score = _distinct(found.placement, score, SEARCH.candidates_apart)
+    first = _best_of_types(found.placement.type, score, SEARCH.candidates_a_type, types)
+    return best_first(found, score + jnp.where(first, _CROWDED_OUT_NATS, 0.0), min(SEARCH.candidates, len(score)))
 
 
 def _gains(
@@ -171,7 +185,7 @@ def find_proposal(
     depth = scene.depth[half : half + height, half : half + width]
     returns = unexplained_returns(depth, image, noise)
     found, score = candidates(scene, returns, context, shape, overlap_limit)
-    rough = _rough_gains(depth, context, noise, window)
+    rough = _rough_gains(scene.depth, context, noise, window)
     found, best = _starts(found, score, rough, library)
     worth = best > SEARCH.worth_nats
     mixture, pilots = jax.lax.cond(
@@ -188,16 +202,13 @@ def find_proposal(
     return proposal, jnp.where(worth, path, jnp.ones(SAMPLER.planned_levels))
 
 
-def _rough_gains(depth: Float[Array, "H W"], context: Context, noise: Noise, window: int) -> Gains:
-    """Gains over a scene at a noise that is no smaller than `least_sigma`, of a wide image at half its resolution."""
-    image, library, table = context
-    fewer = 2 if image.depth.shape[1] >= SEARCH.halved_from else 1
-    small = Context(halved(image) if fewer == 2 else image, library, table)
-    small_depth = pad_scene(depth[::fewer, ::fewer], window)
+def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int) -> Gains:
+    """Gains over a scene at a noise that is no smaller than `least_sigma`. At half the resolution a sliver of an object
+    has too few pixels."""
     blurred = noise._replace(sigma=jnp.maximum(noise.sigma, SEARCH.least_sigma))
 
     def rough(placement: Placement) -> Float[Array, "N"]:
-        return fewer**2 * _gains(placement, small_depth, small, blurred, window)
+        return _gains(placement, depth, context, blurred, window)
 
     return rough
 
@@ -206,11 +217,12 @@ def _starts(
     found: Hypotheses, score: Float[Array, "C"], rough: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, ""]]:
     """The hypotheses to follow uphill, and the gain of the best."""
-    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), SEARCH.candidates)
+    found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), len(score))
     best = gain[0]
     gain = _distinct(found.placement, gain, SEARCH.starts_apart)
-    gain = _apart(found.placement, gain, library, SEARCH.starts * 3 // 4)
-    found, _ = best_first(found, gain, SEARCH.starts)
+    first = _best_of_types(found.placement.type, gain, 1, SEARCH.start_types)
+    gain = _apart(found.placement, gain, library, SEARCH.starts * 3 // 4) + jnp.where(first, _CROWDED_OUT_NATS, 0.0)
+    found, _ = best_first(found, gain, SEARCH.starts + SEARCH.start_types)
     return found, best
 
 
@@ -227,10 +239,11 @@ def _searched(
     _, library, table = context
     narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
     modes, value = narrow(narrow_key, found, rough)
-    modes, value = best_first(modes, value, SEARCH.starts)
+    modes, value = best_first(modes, value, len(value))
     value = _distinct(modes.placement, value, SEARCH.finalists_apart)
-    value = _apart(modes.placement, value, library, SEARCH.finalists - 1)
-    modes, _ = best_first(modes, value, SEARCH.finalists)
+    first = _best_of_types(modes.placement.type, value, 1, SEARCH.finalist_types)
+    value = _apart(modes.placement, value, library, SEARCH.finalists - SEARCH.finalist_types - 1)
+    modes, _ = best_first(modes, value + jnp.where(first, _CROWDED_OUT_NATS, 0.0), SEARCH.finalists)
     grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
     noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
     rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)

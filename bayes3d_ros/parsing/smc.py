@@ -37,7 +37,7 @@ from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
-from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample
+from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample, systematic
 from bayes3d_ros.sampling.tempering import longest_step
 
 
@@ -126,11 +126,13 @@ def step(
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
-        return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, lineage=jnp.arange(particles))
+        return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, lineage=jnp.arange(len(ancestor)))
 
-    start = extend(ancestor, propose(draw_key, proposal, particles, library, table))
+    each = SAMPLER.draws_a_particle
+    ancestor, log_weight = jnp.repeat(ancestor, each), jnp.repeat(log_weight, each) - jnp.log(each)
+    start = extend(ancestor, propose(draw_key, proposal, len(ancestor), library, table))
     end, log_weight, log_evidence, ess = _anneal(
-        anneal_key, start, log_weight, exponents, extend, proposal, context, ess_threshold
+        anneal_key, start, log_weight, particles, exponents, extend, proposal, context, ess_threshold
     )
     own = jax.lax.cond(
         count == 0,
@@ -179,37 +181,53 @@ def refresh(
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 
-def _anneal(key, start, log_weight, exponents, extend, proposal, context, ess_threshold):
-    """From draws of the proposal to weighted draws of the target; the log of its evidence and the least ESS met."""
+def _anneal(key, start, log_weight, particles, exponents, extend, proposal, context, ess_threshold):
+    """From draws of the proposal, of which there are more, to so many weighted draws of the target; the log of its
+    evidence and the least ESS met, as a fraction of the particles and 1 at most."""
+    draws = len(log_weight)
+
+    def exponent(level: Array, b: Array, extended: Proposed, log_weight: Array, each: float) -> Array:
+        c = jnp.where(level < SAMPLER.most_levels - 1, exponents[jnp.argmax(exponents > b)], 1.0)
+        planned = each * effective_fraction(log_weight + (c - b) * extended.log_ratio)
+        shorter = longest_step(b, c, extended.log_ratio, log_weight, SAMPLER.step_keeps)
+        return jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
+
+    def moved(level_key: Array, level: Array, c: Array, extended: Proposed, where: Array) -> Proposed:
+        def move(number: Array, extended: Proposed) -> Proposed:
+            move_key, choice = jax.random.fold_in(level_key, number), (level + number) % 3
+            moved = move_new(move_key, extended, c, choice, extend, proposal, context.library, context.table)
+            fresh = (choice == 2) & (moved.new.x != extended.new.x)
+            begun = cast(Array, moved.lineage) + (level + 1) * draws
+            return moved._replace(lineage=jnp.where(fresh, begun, cast(Array, extended.lineage)))
+
+        moves = jnp.where(where, jnp.where(c < 1, 1, SAMPLER.moves_at_target), 0)
+        return jax.lax.fori_loop(0, moves, move, extended)
 
     def going(state: tuple) -> Array:
         return state[1] < 1.0
 
     def step(state: tuple) -> tuple:
         level, b, extended, log_weight, log_evidence, ess = state
-        c = jnp.where(level < SAMPLER.most_levels - 1, exponents[jnp.argmax(exponents > b)], 1.0)
-        planned = effective_fraction(log_weight + (c - b) * extended.log_ratio)
-        shorter = longest_step(b, c, extended.log_ratio, log_weight, SAMPLER.step_keeps)
-        c = jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
+        c = exponent(level, b, extended, log_weight, 1.0)
         log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
         now = effective_fraction(log_weight)
-        few = now < ess_threshold
         level_key = jax.random.fold_in(key, level)
         extended, log_weight = resample(
             jax.random.fold_in(level_key, SAMPLER.moves_at_target), extended, log_weight, ess_threshold
         )
-
-        def move(number: Array, extended: Proposed) -> Proposed:
-            move_key, choice = jax.random.fold_in(level_key, number), (level + number) % 3
-            moved = move_new(move_key, extended, c, choice, extend, proposal, context.library, context.table)
-            fresh = (choice == 2) & (moved.new.x != extended.new.x)
-            begun = cast(Array, moved.lineage) + (level + 1) * len(fresh)
-            return moved._replace(lineage=jnp.where(fresh, begun, cast(Array, extended.lineage)))
-
-        moves = jnp.where(few & jnp.isfinite(gained), jnp.where(c < 1, 1, SAMPLER.moves_at_target), 0)
-        extended = jax.lax.fori_loop(0, moves, move, extended)
+        extended = moved(level_key, level, c, extended, (now < ess_threshold) & jnp.isfinite(gained))
         return level + 1, c, extended, log_weight, log_evidence + gained, jnp.minimum(ess, now)
 
-    first = (jnp.int32(0), jnp.float32(0.0), start, log_weight, jnp.float32(0.0), jnp.float32(1.0))
+    # The first step weighs all draws, then thins them: what is likeliest to be missed is a type or a mode of a few
+    # percent, and a draw costs less than a particle that is carried on.
+    level, none = jnp.int32(0), jnp.float32(0.0)
+    c = exponent(level, none, start, log_weight, draws / particles)
+    log_weight, gained = normalised(log_weight + c * start.log_ratio)
+    now = jnp.minimum(effective_fraction(log_weight) * (draws / particles), 1.0)
+    level_key = jax.random.fold_in(key, level)
+    kept = systematic(jax.random.fold_in(level_key, SAMPLER.moves_at_target), log_weight, particles)
+    thinned = jax.tree.map(lambda a: a[kept], start)
+    thinned = moved(level_key, level, c, thinned, (now < ess_threshold) & jnp.isfinite(gained))
+    first = (level + 1, c, thinned, jnp.full(particles, -jnp.log(particles), jnp.float32), gained, now)
     _, _, end, log_weight, log_evidence, ess = jax.lax.while_loop(going, step, first)
     return end, log_weight, log_evidence, ess

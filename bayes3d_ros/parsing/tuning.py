@@ -17,14 +17,14 @@ class SearchTuning(NamedTuple):
     # Surface samples over cells (`coarse_search.py`)
     cell: float = 0.02  # metres, side of a cell; not recorded
     yaws: int = 24  # a turn; not recorded
-    most_cells: int = 512  # searched; not recorded
+    most_cells: int = 1024  # searched, those nearest to unexplained returns first; not recorded
     # Metres of depth. Half a cell's diagonal and half a yaw step displace a point by 2 cm: a thin part then misses what
     # it belongs to.
     coarse_tolerance: float = 0.02
     coarse_penalty: float = 0.5  # of a point seen past, relative to the reward of one that matches; not recorded
     coarse_points: int = 36  # surface samples of a type; not recorded
-    reach: int = 3  # cells: how far from unexplained returns an object's centre is looked for; not recorded
-    fewest_unexplained: int = 8  # pixels of unexplained returns in reach of a cell that is searched; not recorded
+    gathered: int = 3  # cells about a return over which returns are counted; not recorded
+    fewest_unexplained: int = 8  # pixels of unexplained returns there; fewer are not searched for; not recorded
     nats_a_pixel: float = 8.0  # what a pixel explained is worth, roughly; not recorded
     # Consensus of neighbours (`neighbour_depth.py`): of 40 good returns among 200 bad ones 36 points meet too few
     many_outliers: float = 0.3  # share of the returns above which the search looks at consensus; not recorded
@@ -33,16 +33,16 @@ class SearchTuning(NamedTuple):
     consensus_fewest: int = 3  # returns that make a surface; not recorded
     # Candidates (`search.py`)
     best_cells: int = 48  # of type, face and cell, whatever the type; not recorded
-    quarters: int = 4  # of a turn: each of those at the best yaw of each; not recorded
-    halves: int = 2  # of a turn: the best of every type and face in each; not recorded
+    quarters: int = 4  # of a turn: each of those, and the best of every type and face, at the best yaw of each
     aligned_tolerance: float = 0.01  # metres of depth, when all surface samples score what is aligned; not recorded
     aligned_penalty: float = 1.0  # then, of a point seen past, relative to the reward of one that matches; not recorded
-    candidates: int = 32  # scored with the model; not recorded
+    candidates: int = 480  # scored with the model: all of a dozen types; slivers
+    candidates_a_type: int = 6  # of larger libraries, at least; slivers
     candidates_apart: tuple[float, float] = (0.008, 0.1)  # m, rad: of a type and face, nearer are copies; not recorded
-    starts: int = 8  # followed uphill; not recorded
+    starts: int = 8  # followed uphill, beside the best of each type; not recorded
+    start_types: int = 12  # types of which the best is, at most; slivers
     starts_apart: tuple[float, float] = (0.004, 0.05)  # m, rad, the same; not recorded
     repeated_nats: float = 4.0  # a further pose of a type at a place counts less by; mug or cup, two bricks (exactness)
-    halved_from: int = 120  # pixels across: wider images are searched at half their resolution; not recorded
     least_sigma: float = 0.002  # metres: at less, candidates a pixel beside the peak score as misses; not recorded
     worth_nats: float = 5.0  # below, no candidate is worth a search; not recorded
     # Alignment (`alignment.py`)
@@ -56,13 +56,14 @@ class SearchTuning(NamedTuple):
     narrow_rounds: int = 4  # not recorded
     fit_draws: int = 24  # a mode and round, of the paraboloid; not recorded
     fit_rounds: int = 5  # not recorded
-    finalists: int = 4  # modes of the mixture; not recorded
+    finalists: int = 10  # modes of the mixture; slivers
+    finalist_types: int = 6  # of which the best of a type each; slivers
     finalists_apart: tuple[float, float] = (0.006, 0.15)  # m, rad: of a type and face, nearer are copies; not recorded
     inflation: float = 1.5  # of a mode's covariance, as a component's; not recorded
     flatten: float = 4.0  # of the nats between modes before any pilot is drawn; not recorded
     even_share: float = 0.4  # of the first pilots, shared alike: a fit may have missed a peak that draws find
     pilot_rounds: int = 4  # at most; not recorded
-    pilot_draws: int = 96  # not recorded
+    pilot_draws: int = 192  # slivers: p(type) rests on them
     pilot_ess: float = 0.2  # effective fraction of the pilots at which the mixture fits; not recorded
     # Pilots are drawn wider than the mixture (smallest ESS over six frames and six seeds 0.004 before, 0.13 after,
     # together with LATERAL): too narrow a component cannot see that it is.
@@ -82,6 +83,7 @@ class SamplerTuning(NamedTuple):
     """From the mixture to the posterior."""
 
     # The path from the proposal to the target (`smc.py`)
+    draws_a_particle: int = 2  # of the proposal, before they are weighed and thinned; p(type) of slivers
     planned_levels: int = 6  # exponents; not recorded
     step_keeps: float = 0.33  # share of the effective draws that a step of the exponent keeps; not recorded
     most_levels: int = 16  # not recorded

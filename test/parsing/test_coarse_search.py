@@ -11,7 +11,17 @@ import trimesh
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.parsing.coarse_search import UnexplainedReturns, cells_in_turn, score_cells
+from bayes3d_ros.parsing.coarse_search import (
+    Cells,
+    UnexplainedReturns,
+    _distance,
+    cell_grid,
+    cells_in_turn,
+    cells_to_search,
+    reach,
+    score_cells,
+)
+from bayes3d_ros.parsing.tuning import SEARCH
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +42,51 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     share = jnp.asarray(rng.random((2, *depth.shape)), jnp.float32)
     returns = UnexplainedReturns(jnp.asarray(depth, jnp.float32), *share)
     centres, given = jnp.asarray(rng.uniform(-0.4, 0.4, (16, 2)), jnp.float32), min(count, 16)
-    arguments = (centres, jnp.int32(count), returns, image, arrays, scene.table)
+    # What lies out of a type's reach is not searched either.
+    distance = jnp.asarray(rng.uniform(0, 0.14, 16), jnp.float32)
+    arguments = (Cells(centres, distance, jnp.int32(count)), returns, image, arrays, scene.table)
     fast, slow = np.asarray(jax.jit(score_cells)(*arguments)), np.asarray(jax.jit(cells_in_turn)(*arguments))
     # Whole arrays work in blocks of four places.
     assert fast.shape == slow.shape and np.isneginf(fast[given:]).all() and np.isneginf(fast[:, 2:]).all()
     if not given:
         return
-    fast, slow = fast[:given, :2], slow[:given, :2]
+    near = np.asarray(distance)[:given, None, None] <= np.asarray(reach(arrays))[:2]
+    for scores in (fast, slow):
+        assert (np.isfinite(scores[:given, :2]).all(-1) == near).all() and np.isneginf(scores[:given, :2][~near]).all()
+    assert near.any() and not near.all()
+    fast, slow = fast[:given, :2][near], slow[:given, :2][near]
     assert np.ptp(slow) > 100
     # A point half way between two pixels may fall into either.
     assert (np.abs(fast - slow) < 1e-3 * np.ptp(slow)).mean() > 0.995
     assert np.abs(fast - slow).max() < 0.1 * np.ptp(slow)
+
+
+def test_distance_to_the_nearest_source_is_that_of_all_pairs() -> None:
+    source = np.random.default_rng(0).random((13, 21)) < 0.03
+    cells = np.stack(np.meshgrid(np.arange(13), np.arange(21), indexing="ij"), -1)
+    apart = np.linalg.norm(cells[:, :, None] - cells[source], axis=-1).min(-1)
+    np.testing.assert_allclose(_distance(jnp.asarray(source)), SEARCH.cell * apart, rtol=1e-6)
+    assert np.isinf(_distance(jnp.zeros((13, 21), bool))).all()
+
+
+def test_the_centre_of_an_object_is_in_reach_of_each_of_its_returns(scene) -> None:
+    """Also of a long one of which only an end returned."""
+    arrays = library_arrays(Library((model_from_mesh(trimesh.creation.box((0.3, 0.06, 0.04)), "beam", 0.005),)))
+    x, y, yaw = 0.05, -0.02, 0.3
+    end = np.array([x + 0.149 * np.cos(yaw), y + 0.149 * np.sin(yaw), 0.04])
+    T = np.asarray(scene.table.T_camera_table)
+    point = T[:3, :3] @ end + T[:3, 3]
+    image = scene.image(scene.depth(scene.placements((4, 0.02, -0.03, 0.4))))
+    u = int(round(float(point[0] / point[2] * image.focal[0] + image.centre[0])))
+    v = int(round(float(point[1] / point[2] * image.focal[1] + image.centre[1])))
+    shown = np.zeros(image.depth.shape, np.float32)
+    shown[v - 2 : v + 3, u - 2 : u + 3] = 1.0
+    returns = UnexplainedReturns(
+        jnp.full(shown.shape, point[2], jnp.float32), jnp.asarray(shown), jnp.zeros(shown.shape)
+    )
+    cells = cells_to_search(returns, arrays, image, scene.table, cell_grid((1.2, 1.2)))
+    centre, distance = np.asarray(cells.centre), np.asarray(cells.distance)
+    own = np.argmin(np.linalg.norm(centre - [x, y], axis=1))
+    assert np.linalg.norm(centre[own] - [x, y]) < SEARCH.cell and own < int(cells.searched)
+    assert distance[own] <= float(reach(arrays)[0].max())
+    assert (np.diff(distance[: int(cells.searched)]) >= -1e-6).all()

@@ -11,6 +11,7 @@ Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
 
 # Name on the command line -> module; imported when it is run, because it imports jax.
 EXPERIMENTS: dict[str, str] = {
+    "additivity": "bayes3d_ros.validation.experiments.additivity",
     "calibration": "bayes3d_ros.validation.experiments.calibration",
     "calibration-points": "bayes3d_ros.validation.experiments.calibration_points",
     "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -52,6 +52,15 @@ HEADER = (
 )
 
 
+class PlantedScene(NamedTuple):
+    """A frame of one object of a type of the library, of which this share of the columns is in sight."""
+
+    seed: int
+    type_id: int
+    share: float
+    scene: RandomScene
+
+
 def notes(quick: bool) -> list[str]:
     """What the figures are of."""
     return ["no scene of a full run was looked at while the search was mended; those of --quick were"]
@@ -69,14 +78,18 @@ def steps(quick: bool) -> Iterator[list[Row]]:
         library = load_library(ycb_library(TEN_TYPES, Path(folder)))
     parser, arrays = SceneParser(library, settings), library_arrays(library)
     parser.warm_up(REALSENSE.width, REALSENSE.height)
-    things = resting_types(library)
+    for planted in planted_scenes(resting_types(library), quick):
+        yield [scene_row(planted, parser, arrays)]
+
+
+def planted_scenes(things: Sequence[tuple[int, RestingObject]], quick: bool) -> Iterator[PlantedScene]:
+    """Slivers of objects, of each type in turn."""
     for k in range(count(quick)):
         seed = k + QUICK_SEED * quick
         type_id, thing = things[k % len(things)]
         rng = np.random.default_rng([seed, 7])
         share, left = float(rng.uniform(*SHARES)), bool(rng.integers(2))
-        scene = sliver(random_scene(thing, seed), thing, share, left)
-        yield [scene_row(seed, type_id, share, scene, parser, arrays)]
+        yield PlantedScene(seed, type_id, share, sliver(random_scene(thing, seed), thing, share, left))
 
 
 def resting_types(library: Library) -> list[tuple[int, RestingObject]]:
@@ -88,10 +101,9 @@ def resting_types(library: Library) -> list[tuple[int, RestingObject]]:
     return things
 
 
-def scene_row(
-    seed: int, type_id: int, share: float, scene: RandomScene, parser: SceneParser, library: LibraryArrays
-) -> Row:
+def scene_row(planted_scene: PlantedScene, parser: SceneParser, library: LibraryArrays) -> Row:
     """What the sampler and importance sampling about the truth say of a scene of one object."""
+    seed, type_id, share, scene = planted_scene
     row: Row = {"scene": seed, "type": scene.name, "share": round(share, 4)}
     row |= dict.fromkeys(("log_evidence", "planted", "planted_ess", "p_true", "said", "p_said", "seconds", "error"))
     try:
