@@ -14,7 +14,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame, reduced, scored_size
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
 from bayes3d_ros.objects.placement import Table
-from bayes3d_ros.parsing.support_plane import find_plane, table_depth, table_frame, usable_share, workspace
+from bayes3d_ros.parsing.support_plane import depth_of_table, find_plane, table_frame, usable_share, workspace
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
 
@@ -82,7 +82,7 @@ def _as_scored(
     settings: ParserSettings,
 ) -> tuple[ScoredImage, Table]:
     """The image and the table in it for JAX, from depth in metres, 0 where there is no return."""
-    bare = np.where(pixel_class != BEYOND, table_depth(camera.rays(), T_camera_table, settings.far), np.inf)
+    bare = np.where(pixel_class != BEYOND, depth_of_table(camera.rays(), T_camera_table, settings.far), np.inf)
     likelihood, weight = Likelihood(settings.likelihood), np.float32(settings.pixel_weight)
     near, far, sigma_max = settings.near, settings.far, settings.sigma_max
     image = scored_image(camera, depth, pixel_class, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)

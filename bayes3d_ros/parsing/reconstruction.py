@@ -17,7 +17,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.tiles import BEHIND
 from bayes3d_ros.objects.library_arrays import LibraryArrays
-from bayes3d_ros.parsing.support_plane import table_depth
+from bayes3d_ros.parsing.support_plane import depth_of_table
 
 _RAYS_A_CALL = 1 << 14  # one compilation for any image
 _MARGIN_PIXELS = 2  # pixels about what the corners of an object's grid enclose: more than rounding may move them
@@ -36,7 +36,7 @@ def render_scene(
     """Depth in metres of the table, up to `far`, and of objects on it, NaN where there is no surface; and labels, 0
     where there is no object, k + 1 where the k-th is seen."""
     rays = camera.rays()
-    depth = table_depth(rays, T_camera_table, far).astype(np.float32)
+    depth = depth_of_table(rays, T_camera_table, far).astype(np.float32)
     labels = np.zeros(depth.shape, np.uint16)
     for label, (type_id, T) in enumerate(zip(types, T_camera_object, strict=True), 1):
         where = _covered(type_id, T, camera, library)

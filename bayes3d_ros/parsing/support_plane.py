@@ -148,7 +148,7 @@ def workspace(
     return np.where(stands | table, IN_WORKSPACE, np.where(other, BEYOND, NO_RETURN))
 
 
-def table_depth(
+def depth_of_table(
     rays: Float[np.ndarray, "H W 3"], T_camera_table: Float[np.ndarray, "4 4"], far: float
 ) -> Float[np.ndarray, "H W"]:
     """Depth in metres at which rays (x, y, 1) meet the table's plane from above, inf where they do not before `far`."""
@@ -169,7 +169,7 @@ def usable_share(
     """Of the pixels whose rays (x, y, 1) meet the table's prior area before `far` metres, the share whose return the
     likelihood makes use of: as the table's, as that of what stands on it, or as evidence that nothing is in between.
     NaN where no ray meets it."""
-    bare = table_depth(rays, T_camera_table, far)
+    bare = depth_of_table(rays, T_camera_table, far)
     met = np.isfinite(bare)
     local = (rays[met] * bare[met, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
     on_table = (np.abs(local) < np.array(table_size) / 2).all(-1)

@@ -7,7 +7,7 @@ import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
-from bayes3d_ros.parsing.support_plane import find_plane, table_depth, table_frame, usable_share, workspace
+from bayes3d_ros.parsing.support_plane import depth_of_table, find_plane, table_frame, usable_share, workspace
 from bayes3d_ros.posterior.types import ParseError
 
 CAMERA = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
@@ -92,7 +92,7 @@ def test_the_share_of_usable_pixels_is_of_those_that_look_at_the_table():
     depth, up = scene(np.random.default_rng(3))
     points = unproject(depth, CAMERA)[np.isfinite(depth)]
     T, size, rays = table_frame(find_plane(points), points), (0.4, 0.3), CAMERA.rays()
-    bare = table_depth(rays, T, 5.0)
+    bare = depth_of_table(rays, T, 5.0)
     local = ((rays * bare[..., None])[np.isfinite(bare)] - T[:3, 3]) @ T[:3, :2]
     np.testing.assert_allclose(bare[60:] * -(rays[60:] @ up), HEIGHT, atol=0.002)
     on_table = np.zeros(depth.shape, bool)

@@ -15,7 +15,7 @@ from bayes3d_ros.validation.reference.exact_reference import (
     FINE_YAW_BINS,
     all_cells,
     all_gains,
-    empty_table,
+    bare_scene,
     enumerate_object,
     single,
     take,
@@ -108,7 +108,7 @@ def test_evidence_converges(mug, found):
 
 def test_objects_far_apart_explain_the_image_apart(blocks):
     """What the sum over pairs rests on: where the mass is, the other object changes no gain, and none conflicts."""
-    scene, rng = empty_table(blocks), np.random.default_rng(0)
+    scene, rng = bare_scene(blocks), np.random.default_rng(0)
     some = []
     for place in true_places(blocks):
         cells = heaviest(enumerate_object(blocks, scene, FEW[:3], close_to(*place)).cells)

@@ -21,8 +21,8 @@ from bayes3d_ros.validation.reference.exact_reference import (
     Marginals,
     Where,
     all_gains,
+    bare_scene,
     chosen,
-    empty_table,
     enumerate_object,
     heavy,
     marginals,
@@ -54,7 +54,7 @@ def enumerate_apart(problem: SmallProblem, levels: Levels = LEVELS) -> TwoObject
 
     the two because lists of two objects hold every set twice.
     """
-    scene = empty_table(problem)
+    scene = bare_scene(problem)
     parts = [enumerate_object(problem, scene, levels, close_to(*place)) for place in true_places(problem)]
     cells = [heaviest(part.cells) for part in parts]
     to_fine = _to_fine(problem.grid)

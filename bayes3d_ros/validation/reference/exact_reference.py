@@ -79,7 +79,7 @@ class Reference(NamedTuple):
         return marginals(problem, self.cells.placement, weight, self.cells.width)
 
 
-def empty_table(problem: SmallProblem) -> GivenScene:
+def bare_scene(problem: SmallProblem) -> GivenScene:
     return _given_scene(problem, problem.context.image.bare_depth)
 
 
@@ -184,7 +184,7 @@ def enumerate_object(
 ) -> Reference:
     """The posterior of one object added to a scene (by default the empty table). The best cells are halved len(levels)
     times, fewer once the evidence stands still. `where` leaves out cells of the first level."""
-    scene = empty_table(problem) if scene is None else scene
+    scene = bare_scene(problem) if scene is None else scene
     placement, width = all_cells(problem, cell)
     if where is not None:
         inside = where(placement)

@@ -74,7 +74,7 @@ def cup(handle: bool) -> trimesh.Trimesh:
     return _joined(body, brick(0.03, 0.012, 0.035).apply_translation((0.043, 0, 0.03)))
 
 
-def camera_pose() -> Float[np.ndarray, "4 4"]:
+def small_T_camera_table() -> Float[np.ndarray, "4 4"]:
     """T_camera_table of a camera that looks along +y of the table, down at its origin."""
     c, s = np.cos(SMALL_CAMERA_ELEVATION), np.sin(SMALL_CAMERA_ELEVATION)
     pose = np.eye(4)
@@ -93,7 +93,7 @@ def make(
     outliers are uniform in the frustum's volume."""
     library = Library(tuple(model_from_mesh(mesh, key, SMALL_VOXEL) for key, mesh in meshes.items()))
     arrays = library_arrays(library)
-    table = Table(jnp.asarray(camera_pose(), jnp.float32), jnp.array(TABLE_SIZE))
+    table = Table(jnp.asarray(small_T_camera_table(), jnp.float32), jnp.array(TABLE_SIZE))
     truth = upright(library, arrays.T_contact_object, rows)
     bare = _bare_table(SMALL_CAMERA)
     depth = bare.copy()
@@ -132,7 +132,7 @@ def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], row
 
 
 def _bare_table(camera: Intrinsics) -> Float[np.ndarray, "H W"]:
-    T, rays = camera_pose(), camera.rays()
+    T, rays = small_T_camera_table(), camera.rays()
     facing = rays @ T[:3, 2]
     with np.errstate(divide="ignore"):
         depth = T[:3, 2] @ T[:3, 3] / facing
