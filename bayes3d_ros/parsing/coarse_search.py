@@ -31,7 +31,7 @@ class UnexplainedReturns(NamedTuple):
     explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
 
 
-class Cells(NamedTuple):
+class CellsInReach(NamedTuple):
     """Places on the table where an object's centre is looked for; the first `searched` of them."""
 
     centre: Float[Array, "C 2"]  # metres, in the table's frame
@@ -108,13 +108,13 @@ def _score(
 
 
 def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
-    """Cells along x and y of the table's rectangle."""
+    """CellsInReach along x and y of the table's rectangle."""
     return int(-(-table_size[0] // SEARCH.cell)), int(-(-table_size[1] // SEARCH.cell))
 
 
 def cells_to_search(
     returns: UnexplainedReturns, library: LibraryArrays, image: ScoredImage, table: Table, shape: tuple[int, int]
-) -> Cells:
+) -> CellsInReach:
     """The cells that an object's centre may be in, given that it shows one of the unexplained returns: those nearest to
     the returns first."""
     xy = table_xy(returns.depth, image, table)
@@ -133,7 +133,7 @@ def cells_to_search(
     distance = apart.ravel()[where]
     real = (jnp.arange(library.first.shape[0]) < library.num_types)[:, None]
     farthest = jnp.where(real, reach(library), 0.0).max()
-    return Cells(centre, distance, (distance <= farthest).sum())
+    return CellsInReach(centre, distance, (distance <= farthest).sum())
 
 
 def reach(library: LibraryArrays) -> Float[Array, "K 6"]:
@@ -157,7 +157,7 @@ def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Fl
 
 
 def score_cells(
-    cells: Cells,
+    cells: CellsInReach,
     returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,
@@ -203,7 +203,7 @@ def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
 
 
 def cells_in_turn(
-    cells: Cells,
+    cells: CellsInReach,
     returns: UnexplainedReturns,
     image: ScoredImage,
     library: LibraryArrays,

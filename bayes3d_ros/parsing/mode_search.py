@@ -75,14 +75,16 @@ def _move(placement: Placement, step: Float[Array, "M 3"]) -> Placement:
     return placement._replace(x=placement.x + step[:, 0], y=placement.y + step[:, 1], yaw=placement.yaw + step[:, 2])
 
 
-def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypotheses, Float[Array, "M"]]:
+def narrow(
+    key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
+) -> tuple[Hypotheses, Float[Array, "M"]]:
     """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
     best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes
     and theirs."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         placement, scale = state
-        gauss = jax.random.normal(key, (*placement.type.shape, SEARCH.narrow_draws, 3))
+        gauss = jax.random.normal(key, (*placement.type.shape, draws, 3))
         offset = jnp.einsum("mab,mdb->mda", scale, gauss)
         offset = offset.at[:, 0].set(0.0)  # the mode itself competes with its draws
         value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
@@ -95,7 +97,7 @@ def narrow(key: PRNGKeyArray, start: Hypotheses, gains: Callable) -> tuple[Hypot
         covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
         return Hypotheses(_move(placement, best), factor(covariance)), value.max(1)
 
-    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, SEARCH.narrow_rounds))
+    modes, values = jax.lax.scan(one_round, start, jax.random.split(key, rounds))
     return modes, values[-1]
 
 

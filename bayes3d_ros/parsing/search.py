@@ -216,14 +216,29 @@ def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, w
 def _starts(
     found: Hypotheses, score: Float[Array, "C"], rough: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, ""]]:
-    """The hypotheses to follow uphill, and the gain of the best."""
+    """The hypotheses to follow uphill for a little, and the gain of the best."""
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), len(score))
-    best = gain[0]
-    gain = _distinct(found.placement, gain, SEARCH.starts_apart)
-    first = _best_of_types(found.placement.type, gain, 1, SEARCH.start_types)
-    gain = _apart(found.placement, gain, library, SEARCH.starts * 3 // 4) + jnp.where(first, _CROWDED_OUT_NATS, 0.0)
-    found, _ = best_first(found, gain, SEARCH.starts + SEARCH.start_types)
-    return found, best
+    chosen = _types_first(
+        found, gain, SEARCH.starts_apart, (SEARCH.early_a_type, SEARCH.start_types), SEARCH.starts, library
+    )
+    return chosen, gain[0]
+
+
+def _types_first(
+    modes: Hypotheses,
+    value: Float[Array, "N"],
+    near: tuple[float, float],
+    of_types: tuple[int, int],
+    others: int,
+    library: LibraryArrays,
+) -> Hypotheses:
+    """So many of each of so many types, those whose best are best, and so many others, whatever their type. `near`:
+    metres and radians within which two of a type and face are copies. Sorted by falling value beforehand."""
+    each, types = of_types
+    value = _distinct(modes.placement, value, near)
+    first = _best_of_types(modes.placement.type, value, each, types)
+    value = _apart(modes.placement, value, library, others * 3 // 4)
+    return best_first(modes, value + jnp.where(first, _CROWDED_OUT_NATS, 0.0), others + each * types)[0]
 
 
 def _searched(
@@ -237,13 +252,16 @@ def _searched(
 ) -> tuple[Modes, Pilots]:
     """A mixture about the modes that are uphill of what was found, and the pilots that it was fitted to."""
     _, library, table = context
-    narrow_key, sharpen_key, adapt_key = jax.random.split(key, 3)
-    modes, value = narrow(narrow_key, found, rough)
+    early_key, narrow_key, sharpen_key, adapt_key = jax.random.split(key, 4)
+    # A pose that is right but for a centimetre may gain less than a wrong one that was aligned well: each is followed a
+    # little before most are dropped.
+    modes, value = narrow(early_key, found, rough, SEARCH.early_draws, SEARCH.early_rounds)
     modes, value = best_first(modes, value, len(value))
-    value = _distinct(modes.placement, value, SEARCH.finalists_apart)
-    first = _best_of_types(modes.placement.type, value, 1, SEARCH.finalist_types)
-    value = _apart(modes.placement, value, library, SEARCH.finalists - SEARCH.finalist_types - 1)
-    modes, _ = best_first(modes, value + jnp.where(first, _CROWDED_OUT_NATS, 0.0), SEARCH.finalists)
+    modes = _types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
+    modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
+    modes, value = best_first(modes, value, len(value))
+    others = SEARCH.finalists - SEARCH.finalist_types
+    modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
     grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
     noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
     rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)

@@ -128,17 +128,16 @@ def step(
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
         return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, lineage=jnp.arange(len(ancestor)))
 
+    def move(key: PRNGKeyArray, at: Proposed, b: Float[Array, ""], which: Int[Array, ""]) -> Proposed:
+        return move_new(key, at, b, which, extend, proposal, library, table)
+
     each = SAMPLER.draws_a_particle
     ancestor, log_weight = jnp.repeat(ancestor, each), jnp.repeat(log_weight, each) - jnp.log(each)
     start = extend(ancestor, propose(draw_key, proposal, len(ancestor), library, table))
     end, log_weight, log_evidence, ess = _anneal(
-        anneal_key, start, log_weight, particles, exponents, extend, proposal, context, ess_threshold
+        anneal_key, start, log_weight, particles, exponents, move, ess_threshold
     )
-    own = jax.lax.cond(
-        count == 0,
-        lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
-        lambda: solo_gain_of(end.new, state.empty, context, grid, window),
-    )
+    own = _own_gain(end, state, count, context, grid, window)
     solo_gain = state.solo_gain[end.ancestor].at[:, count].set(own)
     log_weight, last = normalised(log_weight + log_last(solo_gain, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
@@ -158,6 +157,17 @@ def step(
         proposals=proposals,
         empty=state.empty,
     ), StageInfo(ess)
+
+
+def _own_gain(
+    end: Proposed, state: Population, count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
+) -> Float[Array, "N"]:
+    """Nats that each new object alone gains over the empty table."""
+    return jax.lax.cond(
+        count == 0,
+        lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
+        lambda: solo_gain_of(end.new, state.empty, context, grid, window),
+    )
 
 
 def _lead(state: Population, lead: Int[Array, ""], count: Int[Array, ""]) -> LeadScene:
@@ -181,9 +191,10 @@ def refresh(
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 
-def _anneal(key, start, log_weight, particles, exponents, extend, proposal, context, ess_threshold):
+def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
     """From draws of the proposal, of which there are more, to so many weighted draws of the target; the log of its
-    evidence and the least ESS met, as a fraction of the particles and 1 at most."""
+    evidence and the least ESS met, as a fraction of the particles and 1 at most. move(key, objects, exponent, which):
+    Metropolis-Hastings of one of three kinds (`move_new`)."""
     draws = len(log_weight)
 
     def exponent(level: Array, b: Array, extended: Proposed, log_weight: Array, each: float) -> Array:
@@ -193,15 +204,15 @@ def _anneal(key, start, log_weight, particles, exponents, extend, proposal, cont
         return jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
 
     def moved(level_key: Array, level: Array, c: Array, extended: Proposed, where: Array) -> Proposed:
-        def move(number: Array, extended: Proposed) -> Proposed:
-            move_key, choice = jax.random.fold_in(level_key, number), (level + number) % 3
-            moved = move_new(move_key, extended, c, choice, extend, proposal, context.library, context.table)
+        def one(number: Array, extended: Proposed) -> Proposed:
+            choice = (level + number) % 3
+            moved = move(jax.random.fold_in(level_key, number), extended, c, choice)
             fresh = (choice == 2) & (moved.new.x != extended.new.x)
             begun = cast(Array, moved.lineage) + (level + 1) * draws
             return moved._replace(lineage=jnp.where(fresh, begun, cast(Array, extended.lineage)))
 
         moves = jnp.where(where, jnp.where(c < 1, 1, SAMPLER.moves_at_target), 0)
-        return jax.lax.fori_loop(0, moves, move, extended)
+        return jax.lax.fori_loop(0, moves, one, extended)
 
     def going(state: tuple) -> Array:
         return state[1] < 1.0

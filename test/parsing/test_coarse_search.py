@@ -12,7 +12,7 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.coarse_search import (
-    Cells,
+    CellsInReach,
     UnexplainedReturns,
     _distance,
     cell_grid,
@@ -44,7 +44,7 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     centres, given = jnp.asarray(rng.uniform(-0.4, 0.4, (16, 2)), jnp.float32), min(count, 16)
     # What lies out of a type's reach is not searched either.
     distance = jnp.asarray(rng.uniform(0, 0.14, 16), jnp.float32)
-    arguments = (Cells(centres, distance, jnp.int32(count)), returns, image, arrays, scene.table)
+    arguments = (CellsInReach(centres, distance, jnp.int32(count)), returns, image, arrays, scene.table)
     fast, slow = np.asarray(jax.jit(score_cells)(*arguments)), np.asarray(jax.jit(cells_in_turn)(*arguments))
     # Whole arrays work in blocks of four places.
     assert fast.shape == slow.shape and np.isneginf(fast[given:]).all() and np.isneginf(fast[:, 2:]).all()
