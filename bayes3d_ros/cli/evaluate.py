@@ -36,7 +36,8 @@ def evaluate(experiment: str, quick: bool, out: Path) -> None:
     for note in notes:
         click.echo(note, err=True)
     click.echo(module.HEADER)
-    for rows in progress(module.steps(quick), module.count(quick), "step"):
+    for step in progress(module.steps(quick), module.count(quick), "step"):
+        rows = step()
         report["rows"] += rows
         for row in rows:
             say(module.line(row))

@@ -39,11 +39,14 @@ def stub(monkeypatch):
     """An experiment of two steps; it can be told to fail after the first."""
     state = SimpleNamespace(fails=False, seen=None)
 
-    def steps(quick):
-        yield [{"x": 1.0}]
+    def second():
         if state.fails:
             raise ParseError("no table in sight")
-        yield [{"x": 2.0}, {"x": None}]
+        return [{"x": 2.0}, {"x": None}]
+
+    def steps(quick):
+        yield lambda: [{"x": 1.0}]
+        yield second
 
     def plot(rows, folder):
         (folder / "stub.png").write_bytes(b"")
@@ -225,15 +228,18 @@ def test_frames_of_every_recording_are_parsed(tmp_path, monkeypatch, depth_frame
                 writer.write(depth_frame(stamp))
         (tmp_path / folder / bag / "ground_truth.json").write_text('{"objects": ["block"]}')
 
+    made = []
+
     class Parser:
         def __init__(self, models):
-            self.warm = 0
+            self.library, self.warm = models, None
+            made.append(self)
 
         def warm_up(self, width, height):
-            self.warm += 1
+            self.warm = width, height
 
         def parse(self, frame):
-            assert self.warm == 1
+            assert self.warm == (frame.intrinsics.width, frame.intrinsics.height)
             if frame.stamp_ns == 2:
                 raise ParseError("no table in sight")
             return fake_posterior(frame, library.names)
@@ -248,9 +254,11 @@ def test_frames_of_every_recording_are_parsed(tmp_path, monkeypatch, depth_frame
     monkeypatch.setattr(parsing, "ycb_library", ycb_library)
     monkeypatch.setattr(parsing, "SceneParser", Parser)
     for quick, wanted in ((True, [("bundled", 10), ("real_one", 10)]), (False, [("real_one", 21)])):
+        made.clear()
         steps = list(parsing.steps(quick))
-        assert len(steps) == parsing.count(quick) == (2 if quick else 6)
-        frames = [step[0] for step in steps]
+        assert len(steps) == parsing.count(quick) == (2 if quick else 6) and made == []
+        frames = [step()[0] for step in steps]
+        assert len(made) == (1 if quick else 2)
         assert set(wanted) <= {(row["bag"], row["library"]) for row in frames}
         assert [row["error"] is not None for row in frames] == [not quick and k % 2 == 1 for k in range(len(frames))]
     assert parsing.notes(False) == []

@@ -2,12 +2,14 @@
 
 """Experiments: one module a result, one row of EXPERIMENTS each. `bayes3d evaluate NAME` runs them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, ParamSpec, Protocol, cast
 
 Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
+Step = Callable[[], list[Row]]  # does the work of one step; its rows reach the disk together
+Of = ParamSpec("Of")
 
 # Name on the command line -> module; imported when it is run, because it imports jax.
 EXPERIMENTS: dict[str, str] = {
@@ -34,10 +36,15 @@ class Experiment(Protocol):
         """What a user should know before it starts, such as what is left out and why; one line each."""
 
     def count(self, quick: bool) -> int:
-        """How many steps `steps` takes."""
+        """How many steps there are."""
 
-    def steps(self, quick: bool) -> Iterator[list[Row]]:
-        """The rows of one step after the other; a step's rows reach the disk together."""
+    def steps(self, quick: bool) -> Iterator[Step]:
+        """One step after the other, the same in every run, each to be called once or not at all.
+
+        A run that goes on after an interruption does not call the steps that were done before. So the rows of a step
+        depend on no step before it, neither on their random numbers nor on their results, and its work is done when it
+        is called; what all steps need is prepared before the first one, or when a step first needs it.
+        """
 
     def line(self, row: Row) -> str:
         """A row for people, under HEADER."""
@@ -47,6 +54,11 @@ class Experiment(Protocol):
 
     def plot(self, rows: Sequence[Row], folder: Path) -> list[Path]:
         """Write pictures into the folder; returns their paths."""
+
+
+def row_step(row: Callable[Of, Row], *arguments: Of.args, **options: Of.kwargs) -> Step:
+    """A step of one row: that of these arguments."""
+    return lambda: [row(*arguments, **options)]
 
 
 def load(name: str) -> Experiment:

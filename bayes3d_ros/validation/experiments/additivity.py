@@ -25,10 +25,11 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.parsing import notes, recordings
-from bayes3d_ros.validation.experiments.planted import planted_scenes, resting_types
+from bayes3d_ros.validation.experiments.planted import planted_scene, resting_types
 from bayes3d_ros.validation.experiments.plot_style import label_plot, open_frame
+from bayes3d_ros.validation.simulate.random_scenes import RestingObject
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -42,7 +43,7 @@ def count(quick: bool) -> int:
     return len(recordings(quick=True)) + (QUICK_SCENES if quick else SCENES)
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row a frame."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-additivity-") as folder:
         library = load_library(ycb_library(TEN_TYPES, Path(folder)))
@@ -51,10 +52,17 @@ def steps(quick: bool) -> Iterator[list[Row]]:
     each = [SceneParser(Library((model,)), settings) for model in library.models]
     for recording in recordings(quick=True):
         for frame in islice(read_frames(recording.bag), 1):
-            yield [frame_row(recording.bag.name, frame, whole, each)]
-    scenes = planted_scenes(resting_types(library), quick)
-    for planted in islice(scenes, QUICK_SCENES if quick else SCENES):
-        yield [frame_row(f"sliver {planted.seed}", planted.scene.frame, whole, each)]
+            yield row_step(frame_row, recording.bag.name, frame, whole, each)
+    things = resting_types(library)
+    for k in range(QUICK_SCENES if quick else SCENES):
+        yield row_step(_sliver_row, k, things, quick, whole, each)
+
+
+def _sliver_row(
+    k: int, things: Sequence[tuple[int, RestingObject]], quick: bool, whole: SceneParser, each: Sequence[SceneParser]
+) -> Row:
+    planted = planted_scene(k, things, quick)
+    return frame_row(f"sliver {planted.seed}", planted.scene.frame, whole, each)
 
 
 def frame_row(name: str, frame: DepthFrame, whole: SceneParser, each: Sequence[SceneParser]) -> Row:

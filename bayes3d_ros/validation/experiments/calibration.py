@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES
 from bayes3d_ros.objects.placement import Placement
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.calibration_plot import plot
 from bayes3d_ros.validation.reference.calibration_problem import (
     CalibrationProblem,
@@ -55,11 +55,11 @@ def count(quick: bool) -> int:
     return QUICK_CALIBRATION_SCENES if quick else CALIBRATION_SCENES
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
     problem = small_problem()
     for k in range(count(quick)):
-        yield [scene_row(k, problem)]
+        yield row_step(scene_row, k, problem)
 
 
 def scene_row(k: int, problem: CalibrationProblem, sigma_error: float = 1.0) -> Row:

@@ -8,7 +8,7 @@ sigma_max is so small that windows of 3 x 3 pixels hold the sums: 3 sigma f / z 
 from collections.abc import Iterator
 from dataclasses import replace
 
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Step, row_step
 from bayes3d_ros.validation.experiments.calibration import HEADER, line, notes, plot, scene_row, summary
 from bayes3d_ros.validation.reference.calibration_problem import SETTINGS, small_problem
 
@@ -23,8 +23,8 @@ def count(quick: bool) -> int:
     return QUICK_POINT_SCENES if quick else POINT_SCENES
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
     problem = small_problem(POINTS)
     for k in range(count(quick)):
-        yield [scene_row(k, problem)]
+        yield row_step(scene_row, k, problem)

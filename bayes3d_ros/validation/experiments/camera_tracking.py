@@ -26,7 +26,7 @@ from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import KnownWorld
 from bayes3d_ros.tracking.tracker import CameraTracker
 from bayes3d_ros.validation.bench.benchmark import ycb_library, ycb_mesh
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.simulate.panning_camera import independent_frames, own_frames, panning_cameras
 from bayes3d_ros.validation.statistics.metrics import rotation_error_degrees, translation_error
@@ -82,13 +82,13 @@ def count(quick: bool) -> int:
     return len(_cases(quick))
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row each: all frames tracked in turn."""
     with TemporaryDirectory(prefix="bayes3d-tracking-") as folder:
         library = load_library(ycb_library(tuple(OBJECTS.values()), Path(folder)))
     recordings = Recordings(library, QUICK_TRACKED_FRAMES if quick else TRACKED_FRAMES)
     for case in _cases(quick):
-        yield [track_row(recordings, *case)]
+        yield row_step(track_row, recordings, *case)
 
 
 class Recordings:

@@ -3,7 +3,8 @@
 """Whether credible regions hold the truth on frames that no model of ours made: ray-cast meshes, correlated errors."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_library
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.coverage_plot import plot
 from bayes3d_ros.validation.simulate.random_scenes import (
     REALSENSE,
@@ -70,22 +71,28 @@ def count(quick: bool) -> int:
     return QUICK_COVERAGE_SCENES if quick else COVERAGE_SCENES
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """The rows of every scene, one a noise model. Scene k is the same whatever their number."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-coverage-") as folder:
         libraries = {name: load_library(ycb_library((name,), Path(folder) / name)) for name in COVERED_TYPES}
     objects = {name: resting(libraries[name]) for name in COVERED_TYPES}
-    parsers: dict[tuple[str, str], SceneParser] = {}
+    parsers = cache(partial(_warm_parsers, libraries))
     for k in range(count(quick)):
-        name = COVERED_TYPES[k % len(COVERED_TYPES)]
-        scene = random_scene(objects[name], k)
-        rows = []
-        for label, settings in NOISE_MODELS:
-            if (label, name) not in parsers:
-                parsers[label, name] = SceneParser(libraries[name], settings)
-                parsers[label, name].warm_up(REALSENSE.width, REALSENSE.height)
-            rows.append(scene_row(k, label, scene, parsers[label, name]))
-        yield rows
+        yield partial(_scene_rows, k, objects[COVERED_TYPES[k % len(COVERED_TYPES)]], parsers)
+
+
+def _warm_parsers(libraries: dict[str, Library], name: str) -> dict[str, SceneParser]:
+    """A type's parsers by their noise models' names."""
+    parsers = {label: SceneParser(libraries[name], settings) for label, settings in NOISE_MODELS}
+    for parser in parsers.values():
+        parser.warm_up(REALSENSE.width, REALSENSE.height)
+    return parsers
+
+
+def _scene_rows(k: int, thing: RestingObject, parsers: Callable[[str], dict[str, SceneParser]]) -> list[Row]:
+    """The rows of scene k, with the parsers of its type."""
+    scene = random_scene(thing, k)
+    return [scene_row(k, label, scene, parser) for label, parser in parsers(thing.name).items()]
 
 
 def resting(library: Library) -> RestingObject:

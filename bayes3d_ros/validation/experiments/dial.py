@@ -4,6 +4,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,13 +15,14 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_library
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
@@ -45,21 +47,26 @@ def count(quick: bool) -> int:
     return len(BAGS) * len(QUICK_DIAL_PARTICLES if quick else DIAL_PARTICLES)
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
-    """The first frame of each recording, every seed; compiled beforehand."""
+def steps(quick: bool) -> Iterator[Step]:
+    """The first frame of each recording, every seed."""
     with TemporaryDirectory() as folder:
         library = load_library(ycb_library(DIAL_TYPES, Path(folder)))
     for particles in QUICK_DIAL_PARTICLES if quick else DIAL_PARTICLES:
         for bag in BAGS:
-            frame = next(iter(read_frames(share_directory() / "bags" / bag)))
-            rows = []
-            for seed in range(QUICK_DIAL_SEEDS if quick else DIAL_SEEDS):
-                parser = SceneParser(library, ParserSettings(particles=particles, seed=seed))
-                if seed == 0:
-                    parser.parse(frame)
-                start = time.perf_counter()
-                rows.append(_row(bag, particles, seed, parser.parse(frame), time.perf_counter() - start))
-            yield rows
+            yield partial(_seeds_rows, bag, particles, QUICK_DIAL_SEEDS if quick else DIAL_SEEDS, library)
+
+
+def _seeds_rows(bag: str, particles: int, seeds: int, library: Library) -> list[Row]:
+    """A row a seed; compiled beforehand."""
+    frame = next(iter(read_frames(share_directory() / "bags" / bag)))
+    rows = []
+    for seed in range(seeds):
+        parser = SceneParser(library, ParserSettings(particles=particles, seed=seed))
+        if seed == 0:
+            parser.parse(frame)
+        start = time.perf_counter()
+        rows.append(_row(bag, particles, seed, parser.parse(frame), time.perf_counter() - start))
+    return rows
 
 
 def _row(bag: str, particles: int, seed: int, found: ScenePosterior, seconds: float) -> Row:

@@ -4,6 +4,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.exactness_plot import plot
 from bayes3d_ros.validation.reference.exact_pairs import enumerate_apart
 from bayes3d_ros.validation.reference.exact_reference import YAW_BINS, Marginals, enumerate_object, marginals
@@ -98,14 +99,37 @@ def count(quick: bool) -> int:
     return len(_names(quick)) * (1 + (QUICK_RUNS if quick else RUNS))
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """One row for the enumeration of a problem, then one for every seed."""
     for name in _names(quick):
-        problem = PROBLEMS[name]()
-        exact = reference_row(problem)
-        yield [exact]
+        enumerated = _Enumerated(name)
+        yield row_step(enumerated.reference)
         for seed in range(QUICK_RUNS if quick else RUNS):
-            yield [seed_row(problem, exact, seed)]
+            yield row_step(enumerated.seed, seed)
+
+
+class _Enumerated:
+    """A problem, made and enumerated when a step first needs it: a run that goes on after the step of the enumeration
+    needs it once more, for the seeds that are left."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    @cached_property
+    def _problem(self) -> SmallProblem:
+        return PROBLEMS[self._name]()
+
+    @cached_property
+    def _exact(self) -> Row:
+        return reference_row(self._problem)
+
+    def reference(self) -> Row:
+        """The row of the enumeration."""
+        return self._exact
+
+    def seed(self, seed: int) -> Row:
+        """The row of a seed."""
+        return seed_row(self._problem, self._exact, seed)
 
 
 def reference_row(problem: SmallProblem) -> Row:

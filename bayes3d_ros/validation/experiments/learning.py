@@ -5,6 +5,7 @@
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.settings import LearnerSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_mesh
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.parsing import Surfaces, estimated_pose
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors
@@ -63,30 +64,37 @@ def count(quick: bool) -> int:
     return len(POSE_NOISE) * len(QUICK_VIEWS if quick else VIEWS)
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """Learn every object, then parse one scene of all of them with these models alone."""
     surfaces = Surfaces()
     things = {name: _thing(name) for name in OBJECT_PLACES}
     scene = _scene_frame(things)
     learn(capture(things["025_mug"], _resting_pose(things["025_mug"], 0, 0, 0), 1, (0.0, 0.0), 0).frames, "warm_up")
     for views in QUICK_VIEWS if quick else VIEWS:
-        for poses, pose_noise in POSE_NOISE.items():
-            models, rows = {}, []
-            for seed, (name, thing) in enumerate(things.items()):
-                T_table_object = _resting_pose(thing, 0.0, 0.0, LEARNED_YAW)
-                captures = capture(thing, T_table_object, views, pose_noise, seed)
-                start = time.perf_counter()
-                learned = learn(captures.frames, name, LearnerSettings(voxel_size=LEARNED_VOXEL))
-                seconds = time.perf_counter() - start
-                errors = shape_errors(learned, captures, thing.mesh, aligned=poses != "exact")
-                models[name] = learned, np.linalg.inv(learned.T_table_object) @ T_table_object
-                rows.append(
-                    {"object": name, "views": views, "camera_poses": poses, "voxel_size": LEARNED_VOXEL}
-                    | {key: round(value, 6) for key, value in errors._asdict().items()}
-                    | {"coverage": round(learned.coverage, 4), "seconds": round(seconds, 3)}
-                )
-            _parse(rows, models, scene, things, surfaces)
-            yield rows
+        for poses in POSE_NOISE:
+            yield partial(_learned_rows, views, poses, scene, things, surfaces)
+
+
+def _learned_rows(
+    views: int, poses: str, scene: DepthFrame, things: dict[str, RestingObject], surfaces: Surfaces
+) -> list[Row]:
+    """A row an object, of models learned from so many views with such camera poses."""
+    models, rows = {}, []
+    for seed, (name, thing) in enumerate(things.items()):
+        T_table_object = _resting_pose(thing, 0.0, 0.0, LEARNED_YAW)
+        captures = capture(thing, T_table_object, views, POSE_NOISE[poses], seed)
+        start = time.perf_counter()
+        learned = learn(captures.frames, name, LearnerSettings(voxel_size=LEARNED_VOXEL))
+        seconds = time.perf_counter() - start
+        errors = shape_errors(learned, captures, thing.mesh, aligned=poses != "exact")
+        models[name] = learned, np.linalg.inv(learned.T_table_object) @ T_table_object
+        rows.append(
+            {"object": name, "views": views, "camera_poses": poses, "voxel_size": LEARNED_VOXEL}
+            | {key: round(value, 6) for key, value in errors._asdict().items()}
+            | {"coverage": round(learned.coverage, 4), "seconds": round(seconds, 3)}
+        )
+    _parse(rows, models, scene, things, surfaces)
+    return rows
 
 
 def _thing(name: str) -> RestingObject:

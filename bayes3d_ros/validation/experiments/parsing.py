@@ -4,6 +4,7 @@
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.io.bags import read_frames
@@ -22,7 +24,7 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, real_recordings, ycb_library, ycb_mesh
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.parsing_plot import plot
 from bayes3d_ros.validation.statistics.credible_regions import distance_outside
 from bayes3d_ros.validation.statistics.ground_truth import GROUND_TRUTH, GroundTruth, TrueObject
@@ -77,33 +79,22 @@ def count(quick: bool) -> int:
     return len(chosen) if quick else sum(len(read_frames(recording.bag)) for recording in chosen)
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """The rows of every frame: one for the frame, one for every true object, one for every false one."""
     chosen = recordings(quick)
     surfaces = Surfaces()
-    with tempfile.TemporaryDirectory(prefix="bayes3d-parsing-") as folder:
-        for types in dict.fromkeys(recording.types for recording in chosen):
-            library = load_library(ycb_library(types, Path(folder) / str(len(types))))
-            parser, size = SceneParser(library), None
-            for recording in (r for r in chosen if r.types == types):
-                truth = GroundTruth(recording.bag)
-                for frame in islice(read_frames(recording.bag), 1 if quick else None):
-                    if size != (frame.intrinsics.width, frame.intrinsics.height):
-                        size = frame.intrinsics.width, frame.intrinsics.height
-                        parser.warm_up(*size)
-                    where = {
-                        "bag": recording.bag.name,
-                        "real": recording.real,
-                        "library": len(types),
-                        "frame": frame.stamp_ns,
-                    }
-                    true = truth.at(frame.stamp_ns)
-                    try:
-                        posterior = parser.parse(frame)
-                    except ParseError as error:
-                        yield failed_rows(where, true, str(error))
-                        continue
-                    yield frame_rows(where, true, posterior, library, surfaces)
+    for types in dict.fromkeys(recording.types for recording in chosen):
+        parser = cache(partial(_parser_of, types))
+        for recording in (r for r in chosen if r.types == types):
+            truth = GroundTruth(recording.bag)
+            for frame in islice(read_frames(recording.bag), 1 if quick else None):
+                where = {
+                    "bag": recording.bag.name,
+                    "real": recording.real,
+                    "library": len(types),
+                    "frame": frame.stamp_ns,
+                }
+                yield partial(_parsed_rows, where, truth.at(frame.stamp_ns), frame, parser, surfaces)
 
 
 class Surfaces:
@@ -118,6 +109,23 @@ class Surfaces:
             mesh = load_mesh(ycb_mesh(type_name))
             self._points[type_name] = np.asarray(trimesh.sample.sample_surface(mesh, ADD_S_POINTS, seed=0)[0])
         return self._points[type_name]
+
+
+def _parser_of(types: tuple[str, ...]) -> SceneParser:
+    with tempfile.TemporaryDirectory(prefix="bayes3d-parsing-") as folder:
+        return SceneParser(load_library(ycb_library(types, Path(folder))))
+
+
+def _parsed_rows(
+    where: Row, true: Sequence[TrueObject], frame: DepthFrame, parser: Callable[[], SceneParser], surfaces: Surfaces
+) -> list[Row]:
+    """Parse a frame; the parser is made for the first frame that asks for it."""
+    parser().warm_up(frame.intrinsics.width, frame.intrinsics.height)
+    try:
+        posterior = parser().parse(frame)
+    except ParseError as error:
+        return failed_rows(where, true, str(error))
+    return frame_rows(where, true, posterior, parser().library, surfaces)
 
 
 def frame_rows(

@@ -26,7 +26,7 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.plot_style import label_plot, open_frame
 from bayes3d_ros.validation.reference.planted_evidence import ENOUGH, placement_of, planted_evidence
 from bayes3d_ros.validation.simulate.random_scenes import (
@@ -71,25 +71,31 @@ def count(quick: bool) -> int:
     return QUICK_SCENES if quick else SCENES
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
     settings = ParserSettings(fixed_objects=1, max_objects=1)
     with tempfile.TemporaryDirectory(prefix="bayes3d-planted-") as folder:
         library = load_library(ycb_library(TEN_TYPES, Path(folder)))
     parser, arrays = SceneParser(library, settings), library_arrays(library)
     parser.warm_up(REALSENSE.width, REALSENSE.height)
-    for planted in planted_scenes(resting_types(library), quick):
-        yield [scene_row(planted, parser, arrays)]
-
-
-def planted_scenes(things: Sequence[tuple[int, RestingObject]], quick: bool) -> Iterator[PlantedScene]:
-    """Slivers of objects, of each type in turn."""
+    things = resting_types(library)
     for k in range(count(quick)):
-        seed = k + (QUICK_SEED if quick else FULL_SEED)
-        type_id, thing = things[k % len(things)]
-        rng = np.random.default_rng([seed, 7])
-        share, left = float(rng.uniform(*SHARES)), bool(rng.integers(2))
-        yield PlantedScene(seed, type_id, share, sliver(random_scene(thing, seed), thing, share, left))
+        yield row_step(_planted_row, k, things, quick, parser, arrays)
+
+
+def _planted_row(
+    k: int, things: Sequence[tuple[int, RestingObject]], quick: bool, parser: SceneParser, library: LibraryArrays
+) -> Row:
+    return scene_row(planted_scene(k, things, quick), parser, library)
+
+
+def planted_scene(k: int, things: Sequence[tuple[int, RestingObject]], quick: bool) -> PlantedScene:
+    """Sliver k of an object, of each type in turn."""
+    seed = k + (QUICK_SEED if quick else FULL_SEED)
+    type_id, thing = things[k % len(things)]
+    rng = np.random.default_rng([seed, 7])
+    share, left = float(rng.uniform(*SHARES)), bool(rng.integers(2))
+    return PlantedScene(seed, type_id, share, sliver(random_scene(thing, seed), thing, share, left))
 
 
 def resting_types(library: Library) -> list[tuple[int, RestingObject]]:
@@ -101,9 +107,9 @@ def resting_types(library: Library) -> list[tuple[int, RestingObject]]:
     return things
 
 
-def scene_row(planted_scene: PlantedScene, parser: SceneParser, library: LibraryArrays) -> Row:
+def scene_row(planted: PlantedScene, parser: SceneParser, library: LibraryArrays) -> Row:
     """What the sampler and importance sampling about the truth say of a scene of one object."""
-    seed, type_id, share, scene = planted_scene
+    seed, type_id, share, scene = planted
     row: Row = {"scene": seed, "type": scene.name, "share": round(share, 4)}
     row |= dict.fromkeys(("log_evidence", "planted", "planted_ess", "p_true", "said", "p_said", "seconds", "error"))
     try:
@@ -112,14 +118,14 @@ def scene_row(planted_scene: PlantedScene, parser: SceneParser, library: Library
     except ParseError as error:
         return row | {"error": str(error)}
     truth, _ = placement_of(type_id, scene.T_table_object, library)
-    planted = planted_evidence(jax.random.key(seed), seen, library, parser.settings, truth)
+    about_truth = planted_evidence(jax.random.key(seed), seen, library, parser.settings, truth)
     weight = np.exp(posterior.samples.log_weight.astype(float))
     p_type = np.bincount(posterior.samples.type[:, 0], weight, minlength=len(parser.library.names))
     said = int(p_type.argmax())
     return row | {
         "log_evidence": round(posterior.log_evidence, 4),
-        "planted": round(planted.log_evidence, 4),
-        "planted_ess": round(planted.ess, 1),
+        "planted": round(about_truth.log_evidence, 4),
+        "planted_ess": round(about_truth.ess, 1),
         "p_true": round(float(p_type[type_id]), 5),
         "said": parser.library.names[said],
         "p_said": round(float(p_type[said]), 5),

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.objects.store import load_library
@@ -21,7 +22,7 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ycb_library
-from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.parsing import notes, recordings
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 
@@ -42,15 +43,19 @@ def count(quick: bool) -> int:
     return len(ten) if quick else sum(len(read_frames(recording.bag)) for recording in ten)
 
 
-def steps(quick: bool) -> Iterator[list[Row]]:
+def steps(quick: bool) -> Iterator[Step]:
     """A row a frame, ten types, default settings but for the seed."""
     chosen = recordings(quick=True)
     with tempfile.TemporaryDirectory(prefix="bayes3d-repeatability-") as folder:
         library = load_library(ycb_library(chosen[0].types, Path(folder)))
-        parsers = [SceneParser(library, ParserSettings(seed=seed)) for seed in TWO_SEEDS]
-        for recording in chosen:
-            for frame in islice(read_frames(recording.bag), 1 if quick else None):
-                yield [frame_row(recording.bag.name, *(parser.parse(frame) for parser in parsers))]
+    first, second = (SceneParser(library, ParserSettings(seed=seed)) for seed in TWO_SEEDS)
+    for recording in chosen:
+        for frame in islice(read_frames(recording.bag), 1 if quick else None):
+            yield row_step(_repeated_row, recording.bag.name, frame, first, second)
+
+
+def _repeated_row(bag: str, frame: DepthFrame, first: SceneParser, second: SceneParser) -> Row:
+    return frame_row(bag, first.parse(frame), second.parse(frame))
 
 
 def frame_row(bag: str, first: ScenePosterior, second: ScenePosterior) -> Row:
