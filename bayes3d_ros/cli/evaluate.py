@@ -2,6 +2,7 @@
 
 """`bayes3d evaluate`: how right the results are."""
 
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,18 @@ import click
 
 from bayes3d_ros.cli.options import FOLDER, device_option
 from bayes3d_ros.cli.progress import progress, say
+from bayes3d_ros.cli.unfinished import CannotGoOnError, steps_on_disk
 from bayes3d_ros.files.atomic import write_json
-from bayes3d_ros.validation.experiments import EXPERIMENTS
+from bayes3d_ros.validation.experiments import EXPERIMENTS, Experiment
 
 
 @click.command()
 @click.argument("experiment", type=click.Choice(list(EXPERIMENTS)))
 @click.option("--quick", is_flag=True, help="A minute or so: every kind of measurement once.")
+@click.option("--fresh", is_flag=True, help="Start anew; default: go on where such a run was interrupted.")
 @click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its plots.")
 @device_option
-def evaluate(experiment: str, quick: bool, out: Path) -> None:
+def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
     """Measure how right the results are: rows as JSON, a summary and plots."""
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.validation import experiments
@@ -27,21 +30,18 @@ def evaluate(experiment: str, quick: bool, out: Path) -> None:
     enable_cache()
     every_core()
     module = experiments.load(experiment)
-    notes = module.notes(quick)
-    report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": notes, "summary": None}
-    report |= {"machine": benchmark.machine(), "versions": benchmark.versions(), "rows": []}
+    report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": module.notes(quick), "summary": None}
+    report |= {"machine": benchmark.machine(), "versions": benchmark.versions(), "sources": benchmark.sources()}
+    report |= {"steps": module.count(quick), "steps_done": 0, "rows": []}
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{experiment}.json"
-    write_json(file, report)  # now, so that a folder that cannot be written to is known before minutes of measuring
-    for note in notes:
+    for note in report["notes"]:
         click.echo(note, err=True)
+    if not fresh:
+        _go_on(report, file)
+    write_json(file, report)  # now, so that a folder that cannot be written to is known before minutes of measuring
     click.echo(module.HEADER)
-    for step in progress(module.steps(quick), module.count(quick), "step"):
-        rows = step()
-        report["rows"] += rows
-        for row in rows:
-            say(module.line(row))
-        write_json(file, report)  # after every step: an interrupted run leaves what it measured
+    _measure(module, report, file)
     report["summary"] = module.summary(report["rows"])
     write_json(file, report)
     click.echo("")
@@ -49,6 +49,30 @@ def evaluate(experiment: str, quick: bool, out: Path) -> None:
         click.echo(f"{name:<20} {_words(value)}")
     for path in (file, *module.plot(report["rows"], out)):
         click.echo(f"{path}")
+
+
+def _go_on(report: dict[str, Any], file: Path) -> None:
+    """Take what an interrupted run of the same kind left over into the report, and say so; or why that cannot be."""
+    try:
+        report["steps_done"], report["rows"] = steps_on_disk(file, report)
+    except CannotGoOnError as error:
+        click.echo(f"starting anew: {file} {error}", err=True)
+    if report["steps_done"]:
+        click.echo(f"going on after step {report['steps_done']} of {report['steps']} ({file})", err=True)
+
+
+def _measure(module: Experiment, report: dict[str, Any], file: Path) -> None:
+    """Do the steps that are left. After every step its rows are on disk: an interrupted run leaves what it measured."""
+    total, done = report["steps"], report["steps_done"]
+    if done == total:
+        return  # and prepare nothing
+    for step in progress(islice(module.steps(report["quick"]), done, None), total, "step", done):
+        rows = step()
+        report["rows"] += rows
+        report["steps_done"] += 1
+        for row in rows:
+            say(module.line(row))
+        write_json(file, report)
 
 
 def _words(value: Any) -> str:

@@ -16,9 +16,9 @@ COMPILING = "compiling, about a minute the first time"
 _TICK = 0.5  # seconds between two looks at the clock
 
 
-def progress(items: Iterable[Item], total: int, unit: str) -> Iterator[Item]:
-    """The items, with a bar on stderr where that is a terminal."""
-    return iter(tqdm(items, total=total, unit=unit, disable=None, leave=False))
+def progress(items: Iterable[Item], total: int, unit: str, done: int = 0) -> Iterator[Item]:
+    """The items, with a bar on stderr where that is a terminal; it begins at those `done` before, of the `total`."""
+    return iter(tqdm(items, total=total, initial=done, unit=unit, disable=None, leave=False))
 
 
 def say(text: str, err: bool = False) -> None:

@@ -4,6 +4,7 @@
 
 import json
 from dataclasses import replace
+from itertools import islice
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,7 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import save_model
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError
 from bayes3d_ros.validation import experiments
-from bayes3d_ros.validation.experiments import parsing, repeatability
+from bayes3d_ros.validation.experiments import calibration, exactness, parsing, repeatability
 from bayes3d_ros.validation.statistics.ground_truth import GroundTruth, TrueObject
 
 SIZE = (0.05, 0.04, 0.03)
@@ -264,6 +265,29 @@ def test_frames_of_every_recording_are_parsed(tmp_path, monkeypatch, depth_frame
     assert parsing.notes(False) == []
     monkeypatch.setenv("BAYES3D_DATA", str(tmp_path / "elsewhere"))
     assert str(tmp_path / "elsewhere") in parsing.notes(False)[0]
+
+
+def test_steps_that_are_passed_over_change_no_other(monkeypatch):
+    """Scene k has its own random numbers, and a problem is made and enumerated once, when a step first needs it."""
+    made = []
+    monkeypatch.setattr(calibration, "small_problem", lambda: "problem")
+    monkeypatch.setattr(calibration, "scene_row", lambda k, problem: {"scene": k, "problem": problem})
+    steps = list(calibration.steps(quick=True))
+    assert len(steps) == calibration.count(quick=True)
+    assert [steps[k]() for k in (7, 2)] == [[{"scene": 7, "problem": "problem"}], [{"scene": 2, "problem": "problem"}]]
+
+    monkeypatch.setattr(
+        exactness, "PROBLEMS", {"a": lambda: made.append("a") or "A", "b": lambda: made.append("b") or "B"}
+    )
+    monkeypatch.setattr(exactness, "QUICK_PROBLEMS", ("a", "b"))
+    monkeypatch.setattr(exactness, "reference_row", lambda problem: made.append(problem) or {"exact": problem})
+    monkeypatch.setattr(exactness, "seed_row", lambda problem, exact, seed: {"problem": problem, "seed": seed} | exact)
+    whole = [step() for step in exactness.steps(quick=True)]
+    assert len(whole) == exactness.count(quick=True) and made == ["a", "A", "b", "B"]
+    made.clear()
+    done = exactness.count(quick=True) // 2 + 3
+    assert [step() for step in islice(exactness.steps(quick=True), done, None)] == whole[done:]
+    assert made == ["b", "B"] and whole[done] == [{"problem": "B", "seed": 2, "exact": "B"}]
 
 
 @pytest.fixture

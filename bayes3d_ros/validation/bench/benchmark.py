@@ -2,6 +2,7 @@
 
 """How fast this machine parses and starts, and what it is: rows of measurements, for people and as JSON."""
 
+import hashlib
 import json
 import os
 import platform
@@ -237,6 +238,17 @@ def versions() -> dict[str, str]:
     """What was measured with."""
     packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "numpy")}
     return {"python": platform.python_version(), "bayes3d_ros": bayes3d_ros.__version__} | packages
+
+
+def sources() -> str:
+    """Twelve digits that change with the package's code: what its version does not tell of a checkout. Not with that
+    of commands and nodes, which no result depends on."""
+    package, digest = Path(bayes3d_ros.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package)
+        if name.parts[0] not in ("cli", "ros"):
+            digest.update(f"{name.as_posix()} ".encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _lines(path: str) -> list[str]:
