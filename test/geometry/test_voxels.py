@@ -41,7 +41,7 @@ def test_volume_of_convex_solids(name, voxel):
     solid = voxelize(mesh, voxel)
     volume = solid.occupancy.sum() * voxel**3
     assert mesh.volume < volume < mesh.volume + 0.8 * mesh.area * voxel
-    np.testing.assert_allclose(solid.centre_of_mass, mesh.center_mass, atol=0.1 * voxel)
+    np.testing.assert_allclose(solid.centre_of_mass, mesh.center_mass, atol=0.035 * voxel)  # measured: 0.016
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -58,7 +58,7 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     assert np.ptp(slow) > 100
     # A point half way between two pixels may fall into either.
     assert (np.abs(fast - slow) < 1e-3 * np.ptp(slow)).mean() > 0.995
-    assert np.abs(fast - slow).max() < 0.1 * np.ptp(slow)
+    assert np.abs(fast - slow).max() < 1e-3 * np.ptp(slow)  # measured: 2e-7
 
 
 def test_distance_to_the_nearest_source_is_that_of_all_pairs() -> None:

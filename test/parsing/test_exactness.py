@@ -161,7 +161,7 @@ def test_a_hidden_handle(hidden, hidden_exact, step):
     assert total_variation(yaw, true) < 0.1
     arc = true > 0.02
     assert arc.sum() >= 6 and spread(true) > np.radians(12)
-    assert spread(yaw) == pytest.approx(spread(true), rel=0.2)
+    assert spread(yaw) == pytest.approx(spread(true), rel=0.03)  # measured: 0.010
     assert (yaw[arc] > true[arc] / 3).all()
 
 

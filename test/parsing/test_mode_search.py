@@ -48,7 +48,9 @@ def test_sharpening_finds_a_peak_and_its_shape():
     modes, value = sharpen(jax.random.key(0), _hypotheses(top + 2 * spread), gains, 24, 5)
     assert value[0] > 1e3 - 1
     np.testing.assert_allclose(np.array([*modes.placement[2:]])[:, 0], top, atol=2e-4)
-    np.testing.assert_allclose(np.diagonal(modes.scale[0] @ modes.scale[0].T) ** 0.5, spread, rtol=0.1)
+    np.testing.assert_allclose(
+        np.diagonal(modes.scale[0] @ modes.scale[0].T) ** 0.5, spread, rtol=0.02
+    )  # measured: 0.004
 
 
 def test_sharpening_a_ridge_without_end_stays_finite():

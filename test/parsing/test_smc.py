@@ -132,7 +132,7 @@ def test_scenes_are_sets(scene, pair):
     errors = [ratio_and_error(values, z)[1] for values, z in zip(alone, shift, strict=True)]
     assert mean == pytest.approx(1, abs=3 * np.hypot(error, np.hypot(*errors)) + 0.05)
     # A single object explains the stronger of the two, wherever it is.
-    assert logsumexp(one) - np.log(len(one)) == pytest.approx(max(shift), abs=0.5)
+    assert logsumexp(one) - np.log(len(one)) == pytest.approx(max(shift), abs=0.25)  # measured: 0.12
     assert expected - max(shift) > 100
 
 
@@ -158,7 +158,7 @@ def test_a_third_object_is_not_worth_its_room(scene, pair):
         # The tables that were summed gain by gain are those of the scenes drawn, up to one constant.
         whole = np.asarray(log_likelihood_scene(state.scenes[:8], context.image, grid.coarse, WINDOW))
         constant = whole - np.asarray(state.loglik_grid[:8])
-        np.testing.assert_allclose(constant, constant[0, 0, 0], atol=0.1)
+        np.testing.assert_allclose(constant, constant[0, 0, 0], atol=0.055)  # measured: 0.026
     share = np.exp(np.array(evidence) + np.arange(4) * np.log(0.1) - evidence[2])
     assert share[2] / share.sum() > 0.95
 

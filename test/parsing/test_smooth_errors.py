@@ -77,5 +77,5 @@ def test_draws_have_that_covariance(scene):
     expected = np.asarray(offset_covariance(one, shown[:1], context, error, WINDOW))[0, 0]
     drawn = np.asarray(draw_offsets(jax.random.key(0), many, shown, context, error, WINDOW))[:, 0]
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(np.cov(drawn.T) / scale, expected / scale, atol=0.12)
+    np.testing.assert_allclose(np.cov(drawn.T) / scale, expected / scale, atol=0.11)  # measured: 0.054
     assert (np.abs(drawn.mean(0)) < 4 * np.sqrt(np.diag(expected) / count)).all()

@@ -140,7 +140,9 @@ def test_two_places_are_two_modes() -> None:
 def test_a_ring_of_yaw_is_one_mode_at_a_pose_of_the_object(seed: int, count: int) -> None:
     """A can: any yaw. The variance of a yaw uniform about the reported one is pi^2 / 3, whichever one that is."""
     (mode,) = statistics(np.random.default_rng(seed).uniform(0, 2 * np.pi, count), seed=seed).modes
-    assert mode.covariance[5, 5] == pytest.approx(np.pi**2 / 3, rel=0.7 if count < 50 else 0.3)
+    assert mode.covariance[5, 5] == pytest.approx(
+        np.pi**2 / 3, rel=0.65 if count < 50 else 0.25
+    )  # measured: 0.33, 0.13
     np.testing.assert_allclose(mode.position, Rotation.from_quat(mode.orientation).apply(OFF_AXIS), atol=0.004)
 
 
@@ -154,7 +156,7 @@ def test_an_arc_of_yaw_is_one_mode_at_its_middle(seed: int, weighted: bool) -> N
         rng.uniform(-half, half, 200), rng.dirichlet(np.ones(200)) if weighted else None, seed=seed
     ).modes
     assert abs(Rotation.from_quat(mode.orientation).as_rotvec()[2]) < np.radians(20)
-    assert mode.covariance[5, 5] == pytest.approx(half**2 / 3, rel=0.4)
+    assert mode.covariance[5, 5] == pytest.approx(half**2 / 3, rel=0.34)  # measured: 0.17
     np.testing.assert_allclose(mode.position, Rotation.from_quat(mode.orientation).apply(OFF_AXIS), atol=0.004)
 
 

@@ -309,4 +309,4 @@ def test_smooth_errors_move_a_pose_as_the_fields_covariance_says():
     kernel = 0.001**2 + 0.002**2 * np.exp(-0.5 * ((p[:, None] - p) ** 2).sum(-1) / 0.05**2)
     gain = np.linalg.solve(J @ J.T, J)
     expected = np.sqrt(np.diag(gain @ kernel @ gain.T))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), expected, rtol=0.25)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), expected, rtol=0.17)  # measured: 0.085

@@ -75,7 +75,7 @@ def test_every_object_has_its_own_bias_and_the_table_none():
         assert np.ptp(error[:, 20:40]) == 0 and np.ptp(error[:, 40:60]) == 0
         drawn.append((error[0, 30], error[0, 50]))
     assert np.abs(drawn).max() <= 0.002
-    np.testing.assert_allclose(np.std(drawn, axis=0), 0.002 / np.sqrt(3), rtol=0.1)
+    np.testing.assert_allclose(np.std(drawn, axis=0), 0.002 / np.sqrt(3), rtol=0.085)  # measured: 0.041
     assert abs(np.corrcoef(np.transpose(drawn))[0, 1]) < 0.15
 
 

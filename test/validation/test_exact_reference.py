@@ -124,7 +124,7 @@ def test_objects_far_apart_explain_the_image_apart(blocks):
 def test_total_variation_and_what_chance_allows():
     assert total_variation([0.5, 0.5, 0], [0, 0.5, 0.5]) == pytest.approx(0.5)
     # Of two equal bins: |share - 1/2|, normal with deviation 1 / (2 sqrt n).
-    assert noise_floor([0.5, 0.5], 400) == pytest.approx(1.96 / 40, rel=0.1)
+    assert noise_floor([0.5, 0.5], 400) == pytest.approx(1.96 / 40, rel=0.065)  # measured: 0.031
     assert noise_floor([1.0, 0.0], 3) == 0
 
 

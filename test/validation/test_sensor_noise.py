@@ -108,7 +108,7 @@ def test_edges_wander_but_surfaces_keep_their_depth():
 def test_dropout_at_edges_and_holes():
     lost = np.isnan(noisy(step_edge(), replace(NO_NOISE, edge_dropout=0.5)))
     assert set(np.flatnonzero(lost.any(0))) == {*range(108, 112), *range(208, 212)}
-    assert lost[:, 108:112].mean() == pytest.approx(0.5, abs=0.12)
+    assert lost[:, 108:112].mean() == pytest.approx(0.5, abs=0.09)  # measured: 0.043
     assert np.isnan(noisy(FLAT, replace(NO_NOISE, hole_dropout=0.1))).mean() == pytest.approx(0.1, abs=0.04)
 
 
