@@ -14,7 +14,7 @@ from bayes3d_ros.likelihood.cpu import call_frame
 from bayes3d_ros.likelihood.cpu.call_frame import EXPECTED, Layout
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, pad_scene, render_objects
-from bayes3d_ros.parsing.coarse_search import UnexplainedReturns, cells_in_turn, score_cells
+from bayes3d_ros.parsing.coarse_search import CellsInReach, UnexplainedReturns, cells_in_turn, score_cells
 
 NOISE, WINDOW = Noise(jnp.array([0.003]), jnp.array([0.05])), 3
 
@@ -82,7 +82,8 @@ def test_the_coarse_search_goes_on_in_xla(planted, scene):
     image = scene.image(scene.depth(scene.placements((4, 0.02, -0.03, 0.4))))
     returns = UnexplainedReturns(image.depth, jnp.ones_like(image.depth), jnp.zeros_like(image.depth))
     centres = jnp.asarray([[0.02, -0.03], [0.0, 0.0], [0.1, 0.1], [-0.1, 0.0]], jnp.float32)
-    given = centres, jnp.int32(4), returns, image, scene.arrays, scene.table
+    cells = CellsInReach(centres, jnp.zeros(4), jnp.int32(4))
+    given = cells, returns, image, scene.arrays, scene.table
     found, expected = (np.asarray(jax.jit(lambda *a, f=f: f(*a))(*given)) for f in (score_cells, cells_in_turn))
     assert np.ptp(expected) > 10
     np.testing.assert_allclose(found, expected, rtol=1e-5)  # seen: 2.3e-6, as XLA fuses the two in its own ways
