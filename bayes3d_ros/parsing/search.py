@@ -124,7 +124,7 @@ def candidates(
     scores = score_cells(cells, returns, image, library, table)
     types = scores.shape[1]
     # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
-    # score flat in yaw); and for every type and face the best of either half turn: none is shut out by a crowd of
+    # score flat in yaw); and for every type and face the best of every quarter turn: none is shut out by a crowd of
     # another.
     _, index = jax.lax.top_k(scores.max(-1).ravel(), SEARCH.best_cells)
     part = SEARCH.yaws // SEARCH.quarters
