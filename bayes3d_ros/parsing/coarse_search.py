@@ -108,7 +108,7 @@ def _score(
 
 
 def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
-    """CellsInReach along x and y of the table's rectangle."""
+    """Cells along x and y of the table's rectangle."""
     return int(-(-table_size[0] // SEARCH.cell)), int(-(-table_size[1] // SEARCH.cell))
 
 

@@ -197,11 +197,15 @@ def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
     Metropolis-Hastings of one of three kinds (`move_new`)."""
     draws = len(log_weight)
 
-    def exponent(level: Array, b: Array, extended: Proposed, log_weight: Array, each: float) -> Array:
+    def weighed(level: Array, b: Array, extended: Proposed, log_weight: Array) -> tuple[Array, ...]:
+        """The next exponent, the weights there, the log of their sum, and their ESS as a fraction of the particles."""
+        each = len(log_weight) / particles
         c = jnp.where(level < SAMPLER.most_levels - 1, exponents[jnp.argmax(exponents > b)], 1.0)
         planned = each * effective_fraction(log_weight + (c - b) * extended.log_ratio)
         shorter = longest_step(b, c, extended.log_ratio, log_weight, SAMPLER.step_keeps)
-        return jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
+        c = jnp.where((planned < SAMPLER.too_uneven) & (level < SAMPLER.most_levels - 1), shorter, c)
+        log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
+        return c, log_weight, gained, jnp.minimum(each * effective_fraction(log_weight), 1.0)
 
     def moved(level_key: Array, level: Array, c: Array, extended: Proposed, where: Array) -> Proposed:
         def one(number: Array, extended: Proposed) -> Proposed:
@@ -219,9 +223,7 @@ def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
 
     def step(state: tuple) -> tuple:
         level, b, extended, log_weight, log_evidence, ess = state
-        c = exponent(level, b, extended, log_weight, 1.0)
-        log_weight, gained = normalised(log_weight + (c - b) * extended.log_ratio)
-        now = effective_fraction(log_weight)
+        c, log_weight, gained, now = weighed(level, b, extended, log_weight)
         level_key = jax.random.fold_in(key, level)
         extended, log_weight = resample(
             jax.random.fold_in(level_key, SAMPLER.moves_at_target), extended, log_weight, ess_threshold
@@ -231,10 +233,8 @@ def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
 
     # The first step weighs all draws, then thins them: what is likeliest to be missed is a type or a mode of a few
     # percent, and a draw costs less than a particle that is carried on.
-    level, none = jnp.int32(0), jnp.float32(0.0)
-    c = exponent(level, none, start, log_weight, draws / particles)
-    log_weight, gained = normalised(log_weight + c * start.log_ratio)
-    now = jnp.minimum(effective_fraction(log_weight) * (draws / particles), 1.0)
+    level = jnp.int32(0)
+    c, log_weight, gained, now = weighed(level, jnp.float32(0.0), start, log_weight)
     level_key = jax.random.fold_in(key, level)
     kept = systematic(jax.random.fold_in(level_key, SAMPLER.moves_at_target), log_weight, particles)
     thinned = jax.tree.map(lambda a: a[kept], start)
