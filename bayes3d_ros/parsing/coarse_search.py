@@ -143,10 +143,20 @@ def reach(library: LibraryArrays) -> Float[Array, "K 6"]:
 
 
 def _distance(source: Bool[Array, "X Y"]) -> Float[Array, "X Y"]:
-    """Of every cell to the nearest source, in metres; inf where there is none."""
+    """Of every cell to the nearest source, in metres; inf where there is none. Row by row, then column by column: all
+    pairs of a table of 10 m would take half a gigabyte."""
     x, y = (jnp.arange(n, dtype=jnp.float32) for n in source.shape)
-    along_x = jnp.where(source, (x[:, None] - x)[..., None] ** 2, jnp.inf).min(1)
-    return SEARCH.cell * jnp.sqrt((along_x[:, None, :] + (y[:, None] - y) ** 2).min(-1))
+    nothing = jnp.full(source.shape, jnp.inf)
+
+    def from_row(k: Int[Array, ""], best: Float[Array, "X Y"]) -> Float[Array, "X Y"]:
+        return jnp.minimum(best, jnp.where(source[k], (x[:, None] - k) ** 2, jnp.inf))
+
+    along_x = jax.lax.fori_loop(0, len(x), from_row, nothing)
+
+    def from_column(k: Int[Array, ""], best: Float[Array, "X Y"]) -> Float[Array, "X Y"]:
+        return jnp.minimum(best, along_x[:, k, None] + (y - k) ** 2)
+
+    return SEARCH.cell * jnp.sqrt(jax.lax.fori_loop(0, len(y), from_column, nothing))
 
 
 def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Float[Array, "H W 2"]:
