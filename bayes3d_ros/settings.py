@@ -7,7 +7,16 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 # Retired names of settings, and the names that took their place. Whoever still gives one is told.
-RETIRED = {"rejuvenation": "rejuvenated_objects", "reheating": "tempering_steps"}
+RETIRED = {
+    "rejuvenation": "rejuvenated_objects",
+    "reheating": "tempering_steps",
+    "pixel_weight": "model_error",
+    "depth_bias": "surface_bias",
+    "depth_waviness": "surface_waves",
+    "waviness_length": "wave_length",
+    "table_height_sigma": "camera_position_sigma",
+    "table_tilt_sigma": "camera_angle_sigma",
+}
 
 
 def retirement(name: str, known: Collection[str]) -> str:
@@ -52,7 +61,7 @@ def _near_before_far(near: float, far: float) -> None:
 class ParserSettings:
     """Settings of the scene parser. The model's own come first, the sampler's after them."""
 
-    max_objects: int = setting(8, "most objects a scene may hold", low=0, high=32)
+    max_objects: int = setting(12, "most objects a scene may hold", low=0, high=32)
     fixed_objects: int = setting(-1, "parse exactly this many objects; -1 infers the number", low=-1, high=32)
     count_ratio: float = setting(0.1, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
     table: str = setting("auto", "where the table's plane comes from", choices=("auto", "pose", "depth"))
@@ -72,33 +81,62 @@ class ParserSettings:
     )
     likelihood: str = setting(
         "depth",
-        "what a return is scored as: the depth of its pixel, or the paper's free 3D point (too sure of the noise)",
-        choices=("depth", "points"),
-    )
-    pixel_weight: float = setting(
-        0.1,
-        "share of every pixel's log likelihood that counts: neighbouring pixels err together; 1 if they do not",
-        low=0.001,
-        high=1.0,
+        "what a return is scored as: the depth of its pixel, with errors that its neighbours share; the same without "
+        "such errors (too sure on real images); or the paper's free 3D point (too sure of the noise)",
+        choices=("depth", "independent", "points"),
     )
     window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
     sigma_max: float = setting(
         0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
     )
-    depth_bias: float = setting(
-        0.0012, "standard deviation of depth errors that an object's pixels share", unit="m", low=0.0, high=0.05
+    surface_bias: float = setting(
+        0.0012, "standard deviation of depth errors that all returns of an object share", unit="m", low=0.0, high=0.05
     )
-    depth_waviness: float = setting(
-        0.0005, "standard deviation of depth errors that are waves over an object", unit="m", low=0.0, high=0.05
+    surface_waves: float = setting(
+        0.0005, "standard deviation of depth errors that are waves over a surface", unit="m", low=0.0, high=0.05
     )
-    waviness_length: float = setting(
+    wave_length: float = setting(
         0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
     )
-    table_height_sigma: float = setting(
-        0.0007, "standard deviation of the table's height about the plane given or found", unit="m", low=0.0, high=0.05
+    model_error: float = setting(
+        0.001,
+        "standard deviation of an object's surface about its model, alike over 15 mm",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
-    table_tilt_sigma: float = setting(
-        0.002, "standard deviation of the table's two tilts about that plane", unit="rad", low=0.0, high=0.2
+    bad_share: float = setting(
+        0.15, "share of an object's surface that is dented, worn or badly seen, up to 2 cm nearer", low=0.0, high=0.9
+    )
+    edge_share: float = setting(
+        0.1, "share of returns at the edges of surfaces that lie anywhere between them", low=0.0, high=0.9
+    )
+    edge_blur: float = setting(
+        0.7,
+        "standard deviation of how far beside its ray a return at an edge may come from",
+        unit="scored px",
+        low=0.0,
+        high=3.0,
+    )
+    outline_sigma: float = setting(
+        0.13,
+        "standard deviation by which an object's whole picture, its outline, stands beside the object",
+        unit="scored px",
+        low=0.0,
+        high=3.0,
+    )
+    image_bias: float = setting(
+        0.001, "standard deviation of depth errors that the whole image shares", unit="m", low=0.0, high=0.05
+    )
+    camera_position_sigma: float = setting(
+        0.002, "standard deviation of a given camera pose's height over the table", unit="m", low=0.0, high=0.1
+    )
+    camera_angle_sigma: float = setting(
+        0.005, "standard deviation of a given camera pose's tilts", unit="rad", low=0.0, high=0.2
+    )
+    unknown: bool = setting(True, "whether a thing may be of no type in the library")
+    unknown_probability: float = setting(
+        0.1, "prior probability that a thing is of no type in the library", low=1e-6, high=0.999
     )
     min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
     particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
@@ -114,9 +152,23 @@ class ParserSettings:
     def __post_init__(self) -> None:
         validate(self)
         _odd_window(self.window)
+        if self.likelihood == "depth" and self.window != 3:
+            raise ValueError(f"window must be 3 with likelihood: depth, got {self.window}")
         if self.fixed_objects > self.max_objects:
             raise ValueError(f"fixed_objects ({self.fixed_objects}) exceeds max_objects ({self.max_objects})")
         _near_before_far(self.near, self.far)
+
+    @property
+    def knows_unknown(self) -> bool:
+        """Whether a thing may be of no type in the library."""
+        return self.unknown and self.shares_errors
+
+    @property
+    def shares_errors(self) -> bool:
+        """Whether neighbouring pixels share errors: with every amplitude zero, `depth` is `independent`."""
+        surface = (self.surface_bias, self.surface_waves, self.model_error, self.bad_share)
+        amplitudes = (*surface, self.edge_share, self.edge_blur)
+        return self.likelihood == "depth" and any(amplitudes)
 
 
 @dataclass(frozen=True)

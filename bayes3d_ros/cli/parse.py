@@ -50,6 +50,7 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
     from bayes3d_ros.io.plots import plot_scene
     from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.jax_runtime import enable_cache
+    from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.parsing.parser import SceneParser
     from bayes3d_ros.posterior.types import ParseError
 
@@ -57,7 +58,7 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
     parser = SceneParser(library, settings)
     failed = 0
     notes: tuple[str, ...] = ()
-    with ResultsWriter(out, library.names) as results:
+    with ResultsWriter(out, type_names(library, settings.knows_unknown)) as results:
         for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
             if not parser.compiled_for(camera.width, camera.height):

@@ -35,6 +35,7 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "seconds": round(float(posterior.seconds), 4),
         "log_evidence": json_number(posterior.log_evidence),
         "num_objects": {str(n): json_number(p) for n, p in posterior.num_objects.items()},
+        "num_unknown": {str(n): json_number(p) for n, p in posterior.num_unknown.items()},
         "noise": {"p_outlier": json_number(posterior.p_outlier), "sigma": json_number(posterior.sigma)},
         "objects": [_object_record(found) for found in posterior.objects],
         "T_camera_table": json_numbers(posterior.T_camera_table),
@@ -53,11 +54,18 @@ def _object_record(found: ObjectEstimate) -> dict[str, Any]:
         "position": json_numbers(found.position),
         "orientation": json_numbers(found.orientation),
         "covariance": json_numbers(found.covariance),
-        "contact_face": int(found.contact_face),
+        "contact_face": _face(found.contact_face),
         "face_probabilities": json_numbers(found.face_probabilities),
         "modes": [_mode_record(mode) for mode in found.modes],
         "explained": json_number(found.explained),
+        "size": None if found.size is None else json_numbers(found.size),
+        "size_sigma": None if found.size_sigma is None else json_numbers(found.size_sigma),
     }
+
+
+def _face(face: int) -> int | None:
+    """None of an unknown thing."""
+    return int(face) if face >= 0 else None
 
 
 def _mode_record(mode: PoseMode) -> dict[str, Any]:
@@ -66,7 +74,7 @@ def _mode_record(mode: PoseMode) -> dict[str, Any]:
         "position": json_numbers(mode.position),
         "orientation": json_numbers(mode.orientation),
         "covariance": json_numbers(mode.covariance),
-        "contact_face": int(mode.contact_face),
+        "contact_face": _face(mode.contact_face),
     }
 
 

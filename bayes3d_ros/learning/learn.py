@@ -19,7 +19,7 @@ from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
 from bayes3d_ros.learning.fusion_constants import CONTRADICTED, SEEN_THROUGH
 from bayes3d_ros.learning.segment import Surface, Thing, View, ViewError, middle, segment, surface
 from bayes3d_ros.objects.mesh_import import contact_normals
-from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel
+from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel, is_reserved
 from bayes3d_ros.settings import LearnerSettings
 
 MOST_VIEWS_A_MODEL = 10
@@ -103,6 +103,8 @@ def check_name(name: str) -> None:
     """Raise LearningError where a model cannot be called so."""
     if not NAME_PATTERN.fullmatch(name):
         raise LearningError(f"name: expected letters, digits, '_' and '-', got {name!r}")
+    if is_reserved(name):
+        raise LearningError(f"name: {name!r} stands for things of no type in the library, expected another")
 
 
 def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) -> list[int]:

@@ -38,7 +38,7 @@ class Gain(Protocol):
 def kernel(image: ScoredImage) -> Gain | None:
     """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
     tile (`tiles.py`): free points, other backends, a CPU whose call frames the kernel cannot read."""
-    if image.likelihood.name != "depth" or image.points is not None:
+    if image.likelihood.name != "independent" or image.points is not None:
         return None
     backend = jax.default_backend()
     if backend == "cpu" and readable():
@@ -50,6 +50,18 @@ def kernel(image: ScoredImage) -> Gain | None:
 
         return triton_gain
     return None
+
+
+def shared_kernel() -> Callable[..., tuple[Array, Array]]:
+    """The kernel of errors that pixels share. Raises RuntimeError where this machine has none: only CPUs do."""
+    if jax.default_backend() != "cpu" or not readable():
+        raise RuntimeError(
+            f"likelihood: depth is computed on CPUs alone, and JAX computes on {jax.default_backend()}: expected "
+            "JAX_PLATFORMS=cpu or likelihood: independent"
+        )
+    from bayes3d_ros.likelihood.cpu.shared_gain import shared_gain
+
+    return shared_gain
 
 
 def depth_kernel() -> Callable[..., Array] | None:

@@ -5,7 +5,7 @@
 `likelihoods` is the one table. Each row gives the density of inliers, and every pixel then has
 p_out a(z) + (1 - p_out) inlier, with a(z) = 3 z^2 / (far^3 - near^3), the density of depth uniform in the frustum.
 
-`depth`, the default, is a density of the depth image. For a return z at a pixel with ray r (r_z = 1), and rendered
+`independent` is a density of the depth image. For a return z at a pixel with ray r (r_z = 1), and rendered
 points y_j r_j in the pixel's window at distance d_j from its ray,
 
     inlier(z) = sum_j w_j N(z; y_j (r_j . r) / |r|^2, sigma^2 / |r|^2),  w_j ~ exp(-d_j^2 / 2 sigma^2) + c,
@@ -60,7 +60,7 @@ class Noise(NamedTuple):
 class Likelihood:
     """A row of `likelihoods`. What is scored carries it: to jit it is a part of the type, like a static argument."""
 
-    name: str = "depth"
+    name: str = "independent"
 
 
 class Pixels(NamedTuple):
@@ -166,7 +166,7 @@ def outlier_density(pixels: Pixels) -> Float[Array, "..."]:
     return pixels.outlier_scale * pixels.depth**2
 
 
-likelihoods: dict[str, Callable] = {"depth": inlier_density, "points": point_density}
+likelihoods: dict[str, Callable] = {"independent": inlier_density, "points": point_density}
 
 
 @partial(jax.jit, static_argnames="window")
@@ -188,7 +188,7 @@ def log_likelihood(
     inlier = likelihoods[pixels.likelihood.name](rendered, pixels, noise.sigma, window)
     outlier, inlier = by_pixel_class(pixels, rendered[half : half + height, half : half + width], inlier)
     tiles = outlier.shape[-1]
-    at_once = 4 if pixels.likelihood.name == "depth" else 2  # densities of other rows may reach further
+    at_once = 4 if pixels.likelihood.name == "independent" else 2  # densities of other rows may reach further
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
     count = inlier.shape[1] if rows is None else rows * width
     total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once, count)

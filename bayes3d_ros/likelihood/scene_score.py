@@ -32,7 +32,7 @@ def pad_scene(depth: Float[Array, "*batch H W"], window: int) -> Float[Array, "*
     return jnp.pad(depth, pad, constant_values=NO_SURFACE)
 
 
-def _hypotheses(placement: Placement, library: LibraryArrays, table: Table) -> RenderedHypotheses:
+def hypotheses_of(placement: Placement, library: LibraryArrays, table: Table) -> RenderedHypotheses:
     """An object each."""
     T = T_camera_object(placement, library, table)
     return RenderedHypotheses(placement.type[:, None], T[:, None], plane=jnp.zeros((len(T), 4)))
@@ -80,7 +80,7 @@ def log_likelihood_gain(
     scenes: padded depth of the ancestors' scenes (`pad_scene`); noise: sigma [S] and p_outlier [P], a grid.
     """
     if gain_of := kernel(image):
-        hypotheses = _hypotheses(placement, library, table)
+        hypotheses = hypotheses_of(placement, library, table)
         return gain_of(hypotheses, SceneDepths(scenes, ancestor), image, library, noise, window)
     half, (tile, chunk) = window // 2, LARGE
 
@@ -108,7 +108,7 @@ def render_objects(
 ) -> Float[Array, "N Hp Wp"]:
     """Scene n with object n rendered into it."""
     if depth := depth_kernel():
-        return depth(_hypotheses(placement, library, table), scenes, image, library, window // 2)
+        return depth(hypotheses_of(placement, library, table), scenes, image, library, window // 2)
     tiled = _tiled(placement, image, library, table, window // 2)
     return render_tiles(tiled, (0, tiled.number), scenes, image, window // 2, LARGE)
 

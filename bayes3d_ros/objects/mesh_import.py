@@ -20,7 +20,7 @@ from bayes3d_ros.geometry.mesh import (
     size_warning,
 )
 from bayes3d_ros.geometry.voxels import voxelize
-from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel
+from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel, is_reserved
 from bayes3d_ros.objects.store import load_model, model_path, refuse_existing, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
@@ -83,6 +83,8 @@ def make_models(
     for path in paths:
         if not NAME_PATTERN.fullmatch(path.stem):
             raise MeshError(f"{path}: the file's stem names the object, it may hold letters, digits, '_' and '-' only")
+        if is_reserved(path.stem):
+            raise MeshError(f"{path}: the file's stem names the object, and {path.stem!r} stands for things of no type")
         if path.stem in stems:
             raise MeshError(f"{path}: names the same object as {stems[path.stem]}; rename one of them")
         if not path.is_file():

@@ -12,6 +12,7 @@ from bayes3d_ros.geometry.voxels import MAX_VOXELS
 
 _SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
+UNKNOWN = "unknown"  # the type of things of no type in the library: no model may have this name, in any case
 
 
 class LibraryError(Exception):
@@ -57,9 +58,16 @@ class ObjectModel:
         return centres + self.surface_normal * self.surface_offset[:, None]
 
 
+def is_reserved(name: str) -> bool:
+    """Whether a name stands for things of no type."""
+    return name.lower() == UNKNOWN
+
+
 def _check(model: ObjectModel) -> None:
     if not isinstance(model.name, str) or not NAME_PATTERN.fullmatch(model.name):
         raise ValueError(f"name must be made of letters, digits, '_' and '-', got {model.name!r}")
+    if is_reserved(model.name):
+        raise ValueError(f"name may not be {model.name!r}, which stands for things of no type in the library")
     if not isinstance(model.provenance, dict):
         raise ValueError(f"provenance must be a dict, got {model.provenance!r}")
     if not _SMALLEST_VOXEL <= model.voxel_size <= _LARGEST:
@@ -114,3 +122,8 @@ class Library:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(m.name for m in self.models)
+
+
+def type_names(library: Library, knows_unknown: bool) -> tuple[str, ...]:
+    """Names of types as a posterior counts them: the library's, and last `unknown` where there may be such things."""
+    return (*library.names, UNKNOWN) if knows_unknown else library.names

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, log_marginal
+from bayes3d_ros.likelihood.scene_score import pad_scene
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.tuning import SAMPLER
@@ -27,17 +27,16 @@ class Empty(NamedTuple):
     log_likelihood: Float[Array, "1"]
 
 
-def empty_table(context: Context, grid: NoiseGrid, window: int) -> Empty:
+def empty_table(context: Context, model: ImageModel, window: int) -> Empty:
     scene = pad_scene(context.image.bare_depth, window)[None]
-    loglik_grid = log_likelihood_scene(scene, context.image, grid.coarse, window)
-    loglik_grid = loglik_grid - loglik_grid.max()
-    return Empty(scene, loglik_grid, log_marginal(loglik_grid, grid))
+    loglik_grid = jnp.asarray(empty_likelihood(model, scene, context.image, window))
+    return Empty(scene, loglik_grid, log_marginal(model, loglik_grid))
 
 
-def solo_gain_of(new: Placement, empty: Empty, context: Context, grid: NoiseGrid, window: int) -> Float[Array, "N"]:
+def solo_gain_of(new: Placement, empty: Empty, context: Context, model: ImageModel, window: int) -> Float[Array, "N"]:
     """Nats that each object gains over the empty table."""
-    gain = log_likelihood_gain(new, jnp.zeros_like(new.type), empty.scene, *context, grid.coarse, window)
-    return log_marginal(empty.loglik_grid + gain, grid) - empty.log_likelihood
+    gained, _ = gain(model, new, jnp.zeros_like(new.type), empty.scene, context, window)
+    return log_marginal(model, empty.loglik_grid + gained) - empty.log_likelihood
 
 
 def log_last(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:

@@ -4,7 +4,6 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,8 +12,11 @@ from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame, reduced, scored_size
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
+from bayes3d_ros.likelihood.shared_errors import Amplitudes, SharedErrorImage, shared_error_image
 from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing.support_plane import depth_of_table, find_plane, table_frame, usable_share, workspace
+from bayes3d_ros.parsing.table_fit import SeenTable, seen_table
+from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
 
@@ -23,13 +25,19 @@ class Observation(NamedTuple):
     """What the model is given of a frame."""
 
     image: ScoredImage
+    errors: SharedErrorImage | None  # of `likelihood: depth`
     table: Table
     camera: Intrinsics  # of the image as it is scored; depth and pixel_class have its size
     depth: Float[np.ndarray, "height width"]  # metres, 0 where there is no return
     pixel_class: Int[np.ndarray, "height width"]
-    T_camera_table: Float[np.ndarray, "4 4"]
+    seen_table: SeenTable
     usable_share: float  # of the scored pixels on the table (`support_plane.py`)
     notes: list[str]  # on where the table comes from
+
+    @property
+    def T_camera_table(self) -> Float[np.ndarray, "4 4"]:
+        """Of the plane that the returns show."""
+        return self.seen_table.T_camera_table
 
 
 def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
@@ -42,16 +50,24 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
             f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
         )
     points = unproject(np.where(returned, depth, np.nan), camera)
-    T_camera_table, notes = _find_table(frame, points[returned], settings.table)
+    T_given, notes = _find_table(frame, points[returned], settings.table)
+    table = seen_table(points[returned], T_given, bool(notes), settings)
+    T_camera_table = table.T_camera_table
     table_size = (settings.table_width, settings.table_depth)
     pixel_class = workspace(points, T_camera_table, table_size, settings.workspace_height)
     depth = np.where(returned, depth, 0.0)
-    image, table = _as_scored(camera, depth, pixel_class, T_camera_table, settings)
+    image, errors = _as_scored(camera, depth, pixel_class, T_camera_table, settings)
     usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
-    return Observation(image, table, camera, depth, pixel_class, T_camera_table, usable, notes)
+    placed = table_of(T_camera_table, settings)
+    return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes)
 
 
-def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, Table]:
+def table_of(T_camera_table: Float[np.ndarray, "4 4"], settings: ParserSettings) -> Table:
+    size = jnp.array((settings.table_width, settings.table_depth), jnp.float32)
+    return Table(jnp.asarray(T_camera_table, jnp.float32), size)
+
+
+def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, SharedErrorImage | None, Table]:
     """A made-up image of a bare table, as a camera 0.8 m above it sees it whose images have this size. Scoring it
     compiles all that a frame needs, and takes no search."""
     across, down = scored_size(width, height, settings.score_width)
@@ -60,7 +76,8 @@ def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[Score
     T_table_camera = np.array([[1, 0, 0, 0], [0, -s, c, -above * c / s], [0, -c, -s, above], [0, 0, 0, 1]])
     depth = above / np.maximum(camera.rays()[..., 1] * c + s, 0.2)
     pixel_class = np.full(depth.shape, IN_WORKSPACE)
-    return _as_scored(camera, depth, pixel_class, np.linalg.inv(T_table_camera), settings)
+    T_camera_table = np.linalg.inv(T_table_camera)
+    return *_as_scored(camera, depth, pixel_class, T_camera_table, settings), table_of(T_camera_table, settings)
 
 
 def _find_table(
@@ -80,11 +97,26 @@ def _as_scored(
     pixel_class: Int[np.ndarray, "height width"],
     T_camera_table: Float[np.ndarray, "4 4"],
     settings: ParserSettings,
-) -> tuple[ScoredImage, Table]:
-    """The image and the table in it for JAX, from depth in metres, 0 where there is no return."""
+) -> tuple[ScoredImage, SharedErrorImage | None]:
+    """The image and its errors, of numpy arrays, from depth in metres, 0 where there is no return."""
     bare = np.where(pixel_class != BEYOND, depth_of_table(camera.rays(), T_camera_table, settings.far), np.inf)
-    likelihood, weight = Likelihood(settings.likelihood), np.float32(settings.pixel_weight)
+    shared = settings.shares_errors
+    likelihood = Likelihood("points" if settings.likelihood == "points" else "independent")
+    weight = np.float32(SEARCH.pixel_weight if shared else 1.0)  # of shared errors only the search scores pixels alone
     near, far, sigma_max = settings.near, settings.far, settings.sigma_max
     image = scored_image(camera, depth, pixel_class, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)
-    size = jnp.array((settings.table_width, settings.table_depth), jnp.float32)
-    return jax.device_put(image), Table(jnp.asarray(T_camera_table, jnp.float32), size)
+    return image, shared_error_image(image, amplitudes_of(settings), sigma_max) if shared else None
+
+
+def amplitudes_of(settings: ParserSettings) -> Amplitudes:
+    known = (
+        settings.surface_bias,
+        settings.surface_waves,
+        settings.wave_length,
+        settings.model_error,
+        settings.bad_share,
+        settings.edge_share,
+        settings.edge_blur,
+    )
+    bias, waves, length, model, bad, edge, blur = map(np.float32, known)
+    return Amplitudes(bias, waves, length, model, bad, edge, blur, np.bool_(settings.unknown))

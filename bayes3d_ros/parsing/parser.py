@@ -9,26 +9,27 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.likelihood import noise_marginal
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
+from bayes3d_ros.likelihood.image_model import ImageModel, sample_noise, shared_errors
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
+from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.objects.library_arrays import library_arrays
-from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.model import Library, type_names
 from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing.best_scene import BestScene
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.explanation import explain
-from bayes3d_ros.parsing.observe import bare_table, observe
+from bayes3d_ros.parsing.observe import Observation, bare_table, observe
 from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
-from bayes3d_ros.parsing.smooth_errors import SmoothError, draw_offsets, draw_table_errors
-from bayes3d_ros.posterior.summarise import summarise
+from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
+from bayes3d_ros.posterior.summarise import Summary, summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import ParserSettings
 
@@ -47,12 +48,14 @@ class SceneParser:
         self._arrays = library_arrays(library)
         self._grid = noise_marginal.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
-        self._sample_noise = jax.jit(noise_marginal.sample)
-        self._draw_offsets = jax.jit(draw_offsets, static_argnames="window")
-        self._draw_table_errors = jax.jit(draw_table_errors, static_argnames="count")
-        bias, waviness, length = settings.depth_bias, settings.depth_waviness, settings.waviness_length
-        self._smooth_error = SmoothError(*map(jnp.float32, (bias, waviness, length)))
+        self._sample_noise = jax.jit(sample_noise)
+        self._gauss = jax.jit(_errors_of_samples, static_argnums=1)
         self._compiled: set[tuple[int, ...]] = set()  # shapes of the arrays that images are scored in
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Names of types: the library's, and `unknown` where there may be such things."""
+        return type_names(self.library, self.settings.knows_unknown)
 
     def compiled_for(self, width: int, height: int) -> bool:
         """Whether parsing an image of this size needs no compilation, which takes tens of seconds. So it is after
@@ -64,11 +67,11 @@ class SceneParser:
         seen by a camera 0.8 m above it, which takes no search. Returns at once where that has been done."""
         if self.compiled_for(width, height):
             return
-        image, table = bare_table(width, height, self.settings)
-        context, grid = self._context(image, table)
+        image, errors, table = bare_table(width, height, self.settings)
+        context, model = self._context(image, errors, table)
         with contextlib.suppress(ParseError):  # a fixed number of objects is not found
-            self._sample(frame_key(0, 0), context, grid)
-        self._refreshed(frame_key(0, 0), self._empty(context, grid), self.settings.max_objects, context, grid)
+            self._sample(frame_key(0, 0), context, model)
+        self._refreshed(frame_key(0, 0), self._empty(context, model), self.settings.max_objects, context, model)
         compile_rendering(self._arrays)
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
@@ -77,20 +80,22 @@ class SceneParser:
         start = time.perf_counter()
         settings = self.settings
         seen = observe(frame, settings)
-        context, grid = self._context(seen.image, seen.table)
-        stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, grid)
-        samples, log_evidence = self._mix(stages, seen.table)
-        summary = summarise(samples, self.library.names, settings.min_probability, self.library)
-        reconstruction, segmentation = self._reconstruct(frame, seen.T_camera_table, samples, summary)
+        context, model = self._context(seen.image, seen.errors, seen.table)
+        stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, model, seen)
+        samples, log_evidence, things = self._mix(stages, seen)
+        summary = summarise(samples, self.types, settings.min_probability, self.library)
+        scene = BestScene(samples, summary, things[summary.reference], len(self.library.names))
+        reconstruction, segmentation = self._reconstruct(frame, seen, scene)
         noise = float(samples.sigma[summary.reference]), settings.sigma_max
         explanation = explain(seen, reconstruction, segmentation, len(summary.objects), noise)
         shares = zip(summary.objects, explanation.explained, strict=True)
         return ScenePosterior(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
-            types=self.library.names,
+            types=self.types,
             objects=tuple(replace(found, explained=share) for found, share in shares),
             num_objects=summary.num_objects,
+            num_unknown=summary.num_unknown,
             p_outlier=summary.p_outlier,
             sigma=summary.sigma,
             log_evidence=log_evidence,
@@ -101,20 +106,28 @@ class SceneParser:
             T_camera_table=seen.T_camera_table,
             ess=tuple(ess),
             seconds=time.perf_counter() - start,
-            notes=(*warning_notes(seen.usable_share, explanation.unexplained), *seen.notes),
+            notes=(*warning_notes(seen.usable_share, explanation.unexplained, self._full(summary)), *seen.notes),
+            room=self.settings.max_objects,
             usable_share=seen.usable_share,
             unexplained=explanation.unexplained,
+            **scene.unknown_returns(seen),
         )
 
-    def _context(self, image: ScoredImage, table: Table) -> tuple[Context, NoiseGrid]:
-        return Context(image, self._arrays, table), noise_marginal.for_image(self._grid, image, self.settings.window)
+    def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> tuple[Context, ImageModel]:
+        on_device = jax.device_put(image)
+        context = Context(on_device, self._arrays, table)
+        if errors is None:
+            return context, noise_marginal.for_image(self._grid, on_device, self.settings.window)
+        return context, jax.device_put(shared_errors(image, errors))
 
-    def _sample(self, key: PRNGKeyArray, context: Context, grid: NoiseGrid) -> tuple[list[Stage], list[float]]:
-        """Stages of the sampler, from the empty table to more objects than the image bears out."""
+    def _sample(
+        self, key: PRNGKeyArray, context: Context, model: ImageModel, seen: Observation | None = None
+    ) -> tuple[list[Stage], list[float]]:
+        """Stages of the sampler, from the empty table to more known objects than the image bears out."""
         settings = self.settings
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
-        state = self._empty(context, grid)
+        state = self._empty(context, model)
         stages: list[Stage] = []
         ess, log_mass = [], [0.0]
         for count in range(last):
@@ -124,7 +137,7 @@ class SceneParser:
                 state,
                 jnp.int32(count),
                 context,
-                grid,
+                model,
                 self._table_size,
                 settings.window,
                 settings.ess_threshold,
@@ -133,26 +146,23 @@ class SceneParser:
             log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
             matters = log_mass[-2] > log_mass[-1] + LEAST_LOG_WEIGHT
             if log_mass[-2] == max(log_mass):
-                before = self._refreshed(key, before, count, context, grid)
-            stages.append(self._keep(jax.random.fold_in(key, 1000 + count), before, context, grid, matters))
+                before = self._refreshed(key, before, count, context, model)
+            keep_key = jax.random.fold_in(key, 1000 + count)
+            stages.append(self._keep(keep_key, before, count, model, seen if matters else None, matters))
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + LEAST_LIKELY_COUNT):
                 break
         if log_mass[-1] == max(log_mass):
-            state = self._refreshed(key, state, len(ess), context, grid)
-        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, context, grid))
-        if fixed:
-            if len(stages) != settings.fixed_objects + 1 or not np.isfinite(stages[-1].log_evidence):
-                raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
-            stages = stages[-1:]
+            state = self._refreshed(key, state, len(ess), context, model)
+        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, len(ess), model, seen))
         return stages, ess
 
-    def _empty(self, context: Context, grid: NoiseGrid) -> smc.Population:
+    def _empty(self, context: Context, model: ImageModel) -> smc.Population:
         settings = self.settings
         slots = max(settings.max_objects, 1)
-        return smc.init(context, grid, settings.particles, slots, self._table_size, settings.window)
+        return smc.init(context, model, settings.particles, slots, self._table_size, settings.window)
 
     def _refreshed(
-        self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, grid: NoiseGrid
+        self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, model: ImageModel
     ) -> smc.Population:
         """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
         tempering."""
@@ -162,42 +172,93 @@ class SceneParser:
         key = jax.random.fold_in(key, 2000 + count)
         effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
         state = smc.refresh(
-            key, state, jnp.int32(count), context, grid, settings.window, settings.ess_threshold, effort
+            key, state, jnp.int32(count), context, model, settings.window, settings.ess_threshold, effort
         )
         self._compiled.add(context.image.depth.shape)  # the last of the slow ones
         return state
 
     def _keep(
-        self, key: PRNGKeyArray, state: smc.Population, context: Context, grid: NoiseGrid, matters: bool = True
+        self,
+        key: PRNGKeyArray,
+        state: smc.Population,
+        count: int,
+        model: ImageModel,
+        seen: Observation | None,
+        matters: bool = True,
     ) -> Stage:
-        """A stage's scenes; only its evidence where they do not matter."""
+        """A stage's scenes of `count` known objects, with what else stands there; only its evidence where they do not
+        matter."""
         if not matters:
             return Stage.without_scenes(float(state.log_evidence), state.objects.x.shape[1])
-        noise = self._sample_noise(key, state.loglik_grid, grid)
-        error, window = self._smooth_error, self.settings.window
-        offset = self._draw_offsets(jax.random.fold_in(key, 1), state.objects, state.scenes, context, error, window)
-        height, tilt = jnp.float32(self.settings.table_height_sigma), jnp.float32(self.settings.table_tilt_sigma)
-        table_error = self._draw_table_errors(jax.random.fold_in(key, 2), len(state.log_weight), height, tilt)
-        objects, offset, table_error, log_weight, noise, log_evidence = jax.device_get(
-            (state.objects, offset, table_error, state.log_weight, noise, state.log_evidence)
+        noise = self._sample_noise(key, model, state.loglik_grid)
+        gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
+        objects, gauss, log_weight, noise, log_evidence = jax.device_get(
+            (state.objects, gauss, state.log_weight, noise, state.log_evidence)
         )
-        return Stage(objects, offset, table_error, log_weight, noise.p_outlier, noise.sigma, float(log_evidence))
+        stage = Stage(
+            objects, gauss, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), [()] * len(log_weight)
+        )
+        return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
 
-    def _mix(self, stages: list[Stage], table: Table) -> tuple[SceneSamples, float]:
-        """The mixture over the number of objects, and log p(image) - log p(image | empty)."""
+    def _with_things(self, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation) -> Stage:
+        """The stage's scenes with things of no type in them."""
         settings = self.settings
-        if settings.fixed_objects >= 0:
-            return mixture(stages, [settings.fixed_objects], np.zeros(1), self._arrays, table)
-        possible = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)
-        log_prior = possible[: len(stages)] - np.logaddexp.reduce(possible)
-        return mixture(stages, range(len(stages)), log_prior, self._arrays, table)
+        half = settings.window // 2
+        fixed = settings.fixed_objects >= 0
+        found = find_things(
+            np.asarray(scenes)[:, half:, half:],
+            seen,
+            float(np.log(settings.count_ratio * settings.unknown_probability)),
+            (settings.fixed_objects if fixed else settings.max_objects) - count,
+            fixed,
+            settings.seed,
+        )
+        log_weight = stage.log_weight + found.log_weight
+        total = np.logaddexp.reduce(log_weight)
+        if not np.isfinite(total):
+            return stage._replace(log_evidence=-np.inf)
+        return stage._replace(
+            log_weight=log_weight - total, log_evidence=stage.log_evidence + float(total), things=found.held
+        )
 
-    def _reconstruct(self, frame, T_camera_table, samples, summary):
+    def _mix(
+        self, stages: list[Stage], seen: Observation
+    ) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
+        """The mixture over the number of known objects, log p(image) - log p(image | empty), and of each sample what is
+        of no type in the library."""
+        settings = self.settings
+        known = np.log1p(-settings.unknown_probability) if self.settings.knows_unknown else 0.0
+        log_prior = np.arange(len(stages)) * (np.log(settings.count_ratio) + known)
+        if settings.fixed_objects < 0:
+            log_prior -= np.logaddexp.reduce(np.arange(settings.max_objects + 1) * np.log(settings.count_ratio))
+        else:
+            log_prior -= settings.fixed_objects * np.log(settings.count_ratio)
+            if not self.settings.knows_unknown:
+                stages = [stage._replace(log_evidence=-np.inf) for stage in stages[:-1]] + stages[-1:]
+            reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
+            if not reached or (not self.settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
+                raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
+        image = seen.image
+        outline = settings.outline_sigma / float(image.focal[0]) if settings.shares_errors else 0.0
+        return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline)
+
+    def _full(self, summary: Summary) -> bool:
+        """Whether a scene could hold no more objects than the best one does."""
+        return self.settings.fixed_objects < 0 and len(summary.objects) >= self.settings.max_objects
+
+    def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):
         """Depth and labels of the best scene at the input's size."""
-        kinds = [int(samples.type[summary.reference, slot]) for slot in summary.slots]
-        place, turn = samples.position[summary.reference], samples.orientation[summary.reference]
-        poses = [pose_matrix(place[slot], turn[slot]) for slot in summary.slots]
-        return render_scene(kinds, poses, T_camera_table, frame.intrinsics, self.settings.far, self._arrays)
+        kinds, poses, labels = scene.known_objects()
+        depth, label = render_scene(
+            kinds, poses, seen.T_camera_table, frame.intrinsics, self.settings.far, self._arrays
+        )
+        label = np.append(0, labels).astype(np.uint16)[label]
+        return scene.with_things(frame, seen, depth, label)
+
+
+def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M1 3"]:
+    """Standard normal numbers for the table and each object of every scene."""
+    return jax.random.normal(key, (shape[0], shape[1] + 1, 3))
 
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:

@@ -2,7 +2,7 @@
 
 """Changes the posterior: constants of the model, beside the settings, that a frame is parsed with.
 
-The likelihood's own stand in `likelihood/density.py`, those of smooth errors in `smooth_errors.py`.
+The likelihood's own stand in `likelihood/density.py`, `likelihood/shared_errors.py` and `likelihood/unknown_depth.py`.
 """
 
 import math
@@ -11,6 +11,9 @@ import math
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
 # A number of objects this much less likely than the best ends the search for more; what is cut off is of second order.
 LEAST_LIKELY_COUNT = math.log(0.15)
+
+LEAST_THING = 4e-4  # metres^2 facing the camera, of something unknown: less is outliers
+THINGS_APART = 0.02  # metres between returns of two unknown things: nearer, they are one
 
 # Which returns are the table's, and which belong to what stands on it (`support_plane.py`)
 PLANE_TOLERANCE = 0.008  # metres at 1 m, growing with depth squared beyond

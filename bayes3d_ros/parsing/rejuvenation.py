@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
+from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal
+from bayes3d_ros.likelihood.scene_score import render_objects
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
 from bayes3d_ros.parsing.context import Context
@@ -37,7 +37,8 @@ class WeightedScenes(NamedTuple):
     objects: Placement  # [N, M]
     solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
     lineage: Int[Array, "N M"]  # which draw of its stage an object descends from; moves here do not change it
-    scenes: Float[Array, "N Hp Wp"]  # padded depth
+    warp: Float[Array, "N M 3"]  # the error that an object's returns share, see `image_model.gain`
+    scenes: Float[Array, "N Hp Wp"]  # padded depth, with these errors
     loglik_grid: Float[Array, "N S P"]
     log_likelihood: Float[Array, "N"]
     log_weight: Float[Array, "N"]  # normalised
@@ -47,7 +48,7 @@ class GivenFrame(NamedTuple):
     """What is fixed while a frame is parsed."""
 
     context: Context
-    grid: NoiseGrid
+    model: ImageModel
     empty: Empty
     window: int
     overlap_limit: float
@@ -95,7 +96,7 @@ def _move(
     heats: Int[Array, ""],
 ) -> WeightedScenes:
     """The object in slot m of every scene."""
-    context, grid, empty, window, overlap_limit, _ = frame
+    context, model, empty, window, overlap_limit, _ = frame
     _, library, table = context
     particles, slots = state.solo_gain.shape
     others = jnp.arange(slots) != m
@@ -106,38 +107,37 @@ def _move(
     # Behind the last slot: not among those that an object may conflict with.
     rest = jax.tree.map(lambda a: a.at[:, m].set(a[:, count - 1]), state.objects)
 
-    def gain(ancestor: Int[Array, "N"], placement: Placement) -> Float[Array, "N S P"]:
-        return log_likelihood_gain(placement, ancestor, without, *context, grid.coarse, window)
-
     everyone, mine = jnp.arange(particles), _slot(state.objects, m)
-    grid_without = state.loglik_grid - gain(everyone, mine)
-    log_likelihood_without = log_marginal(grid_without, grid)
+    grid_without = state.loglik_grid - gain(model, mine, everyone, without, context, window)[0]
+    log_likelihood_without = log_marginal(model, grid_without)
 
-    def with_terms(ancestor, placement, grid_here, solo_gain) -> Proposed:
-        log_likelihood = log_marginal(grid_here, grid)
+    def with_terms(ancestor, placement, grid_here, warp, solo_gain) -> Proposed:
+        log_likelihood = log_marginal(model, grid_here)
         log_q = log_density(placement, proposal, library, table)
         log_target = log_likelihood + log_prior(placement, library, table) + log_order(solo_gain, count)
         log_ratio = log_target - log_likelihood_without[ancestor] - log_q
         clash = conflicts(placement, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library, overlap_limit)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
-        return Proposed(ancestor, placement, grid_here, log_likelihood, log_q, log_ratio, solo_gain=solo_gain)
+        return Proposed(ancestor, placement, grid_here, log_likelihood, log_q, log_ratio, warp, solo_gain=solo_gain)
 
     def extend(ancestor: Int[Array, "N"], placement: Placement) -> Proposed:
         own = jax.lax.cond(
             unclear,
-            lambda: solo_gain_of(placement, empty, context, grid, window),
+            lambda: solo_gain_of(placement, empty, context, model, window),
             lambda: state.solo_gain[ancestor, m],
         )
         solo_gain = state.solo_gain[ancestor].at[:, m].set(own)
-        return with_terms(ancestor, placement, grid_without[ancestor] + gain(ancestor, placement), solo_gain)
+        gained, warp = gain(model, placement, ancestor, without, context, window)
+        return with_terms(ancestor, placement, grid_without[ancestor] + gained, warp, solo_gain)
 
-    start = with_terms(everyone, mine, state.loglik_grid, state.solo_gain)
+    start = with_terms(everyone, mine, state.loglik_grid, state.warp[:, m], state.solo_gain)
     end, log_weight = _heat_and_cool(key, start, state.log_weight, extend, proposal, heats, frame)
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, m].set(b), state.objects, end.new)
-    scenes = render_objects(end.new, without[end.ancestor], *context, window)
+    scenes = with_object(end.new, end.warp, without[end.ancestor], context, window)
+    warp = state.warp[end.ancestor].at[:, m].set(end.warp)
     solo_gain = cast(Array, end.solo_gain)
     return WeightedScenes(
-        objects, solo_gain, state.lineage[end.ancestor], scenes, end.loglik_grid, end.log_likelihood, log_weight
+        objects, solo_gain, state.lineage[end.ancestor], warp, scenes, end.loglik_grid, end.log_likelihood, log_weight
     )
 
 
@@ -147,11 +147,28 @@ def _scenes_without(
     """Padded depth of the scenes without the object in slot m."""
 
     def with_other(j: Array, scenes: Array) -> Array:
-        other = _slot(state.objects, j)
-        return jax.lax.cond(j == m, lambda: scenes, lambda: render_objects(other, scenes, *frame.context, frame.window))
+        other, warp = _slot(state.objects, j), state.warp[:, j]
+        return jax.lax.cond(
+            j == m, lambda: scenes, lambda: with_object(other, warp, scenes, frame.context, frame.window)
+        )
 
     bare = jnp.broadcast_to(frame.empty.scene, state.scenes.shape)
     return jax.lax.fori_loop(0, count, with_other, bare)
+
+
+def with_object(
+    placement: Placement,
+    warp: Float[Array, "N 3"],
+    scenes: Float[Array, "N Hp Wp"],
+    context: Context,
+    window: int,
+) -> Float[Array, "N Hp Wp"]:
+    """Scene n with object n in it, as the camera shows it: with the error that the object's returns share."""
+    rendered = render_objects(placement, scenes, *context, window)
+    half = window // 2
+    column, row = (jnp.arange(n) - half for n in (scenes.shape[2], scenes.shape[1]))
+    plane = warp[:, 0, None, None] + warp[:, 1, None, None] * column + warp[:, 2, None, None] * row[:, None]
+    return jnp.where(rendered < scenes, rendered + plane, scenes)
 
 
 def _heat_and_cool(

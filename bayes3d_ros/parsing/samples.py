@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.poses import slide
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table
+from bayes3d_ros.parsing.table_fit import SeenTable
+from bayes3d_ros.parsing.unknown_things import UnknownThing, drawn_box
 from bayes3d_ros.posterior.types import SceneSamples
 
 LEAST_LOG_WEIGHT = -30.0  # nats: samples of less weight are not kept
@@ -22,12 +24,14 @@ class Stage(NamedTuple):
     """What is kept of the scenes of k objects."""
 
     objects: Placement
-    offset: Float[np.ndarray, "N M 3"]  # of each object against its picture: x, y, yaw
-    table_error: Float[np.ndarray, "N 3"]  # the table against the plane taken for it: two tilts, height
+    gauss: Float[
+        np.ndarray, "N M1 3"
+    ]  # standard normal: of the table's two tilts and height, then of each object's picture
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
     log_evidence: float
+    things: list[tuple[UnknownThing, ...]]  # of each scene, what is of no type in the library
 
     @classmethod
     def without_scenes(cls, log_evidence: float, slots: int) -> "Stage":
@@ -35,8 +39,7 @@ class Stage(NamedTuple):
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        offset, table_error = np.zeros((0, slots, 3), np.float32), np.zeros((0, 3), np.float32)
-        return cls(objects, offset, table_error, zero, zero, zero, log_evidence)
+        return cls(objects, np.zeros((0, slots + 1, 3), np.float32), zero, zero, zero, log_evidence, [])
 
 
 def mixture(
@@ -45,8 +48,11 @@ def mixture(
     log_prior: Float[np.ndarray, "stages"],
     library: LibraryArrays,
     table: Table,
-) -> tuple[SceneSamples, float]:
-    """The mixture of stages of so many objects, p(n | image) ~ P(n) Z_n, and log p(image) - log p(image | empty)."""
+    seen: SeenTable,
+    outline: float,
+) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
+    """The mixture of stages of so many known objects, p(n | image) ~ P(n) Z_n; log p(image) - log p(image | empty); and
+    of each sample what is of no type. outline: standard deviation of where an object's picture stands, as a slope."""
     log_z = np.array([s.log_evidence for s in stages])
     log_evidence = np.logaddexp.reduce(log_prior + log_z)
     log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
@@ -54,38 +60,107 @@ def mixture(
     n = np.repeat(counts, [len(s.log_weight) for s in stages])
     keep = np.flatnonzero(log_weight > LEAST_LOG_WEIGHT)
     objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
-    offset = np.concatenate([s.offset for s in stages])[keep]
-    table_error = np.concatenate([s.table_error for s in stages])[keep]
-    if offset.any() or table_error.any():  # each scene twice, with errors of either sign: means stay where they are
-        sign = np.resize([1.0, -1.0], 2 * len(keep))
-        keep, offset = np.repeat(keep, 2), np.repeat(offset, 2, 0) * sign[:, None, None]
-        table_error = np.repeat(table_error, 2, 0) * sign[:, None]
-        objects = jax.tree.map(lambda a: np.repeat(a, 2, 0), objects)
-        x, y, yaw = objects.x + offset[..., 0], objects.y + offset[..., 1], objects.yaw + offset[..., 2]
-        objects = objects._replace(x=x, y=y, yaw=np.mod(yaw, 2 * np.pi))
+    things = [held for s in stages for held in s.things]
+    things = [things[k] for k in keep] if things else [()] * len(keep)
+    # Each scene twice, with errors of either sign: means stay where they are.
+    gauss = np.concatenate([s.gauss for s in stages])[keep]
+    gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None, None]
+    keep, table_error = np.repeat(keep, 2), gauss[:, 0] * seen.error_sd + seen.error
+    objects = _beside_pictures(
+        jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 1:], library, table, outline
+    )
+    things = [held for held in things for _ in range(2)]
+    moved = _moved(table_error)
     held = np.arange(objects.type.shape[1]) < n[keep, None]
-    T = _T_camera_object(objects, library, table, table_error)
+    T = np.asarray(table.T_camera_table, np.float64) @ moved @ _T_table_object(objects, library)
+    known = _Slots(
+        type=np.where(held, objects.type, -1),
+        face=np.where(held, objects.face, -1),
+        T_camera_object=T,
+        size=np.zeros((*held.shape, 3)),
+    )
+    every = _with_things(known, n[keep], things, int(library.num_types), seen.T_camera_table @ moved[:, 0])
+    held = every.type >= 0
+    T = every.T_camera_object
     quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
     samples = SceneSamples(
         log_weight=(log_weight[keep] - np.logaddexp.reduce(log_weight[keep])).astype(np.float32),
-        num_objects=n[keep].astype(np.int32),
-        type=np.where(held, objects.type, -1).astype(np.int32),
-        face=np.where(held, objects.face, -1).astype(np.int32),
+        num_objects=held.sum(1).astype(np.int32),
+        type=every.type.astype(np.int32),
+        face=every.face.astype(np.int32),
         position=np.where(held[..., None], T[..., :3, 3], 0.0).astype(np.float32),
         orientation=np.where(held[..., None], quaternion, [0, 0, 0, 1]).astype(np.float32),
         p_outlier=np.concatenate([s.p_outlier for s in stages])[keep],
         sigma=np.concatenate([s.sigma for s in stages])[keep],
+        size=every.size.astype(np.float32),
     )
-    return samples, float(log_evidence)
+    return samples, float(log_evidence), things
 
 
-def _T_camera_object(
-    objects: Placement, library: LibraryArrays, table: Table, table_error: Float[np.ndarray, "S 3"]
-) -> Float[np.ndarray, "S M 4 4"]:
-    """In float64 numpy: sample counts differ from frame to frame, and must not recompile."""
-    T_contact = np.asarray(library.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
+def _beside_pictures(
+    pictures: Placement, gauss: Float[np.ndarray, "S M 3"], library: LibraryArrays, table: Table, outline: float
+) -> Placement:
+    """Objects, given their pictures.
+
+    The likelihood is of the picture: where outlines and surfaces are seen. All outlines of an object are displaced
+    together: on the table by N(0, (outline depth)^2) along x and y, and by as much of a turn as moves its corners so
+    far. The prior is flat, so an object given its picture is a normal about it, whatever the image."""
+    T = np.asarray(table.T_camera_table, np.float64)
+    depth = T[2, 0] * pictures.x + T[2, 1] * pictures.y + T[2, 3]
+    size = np.asarray(library.face_size, np.float64)[pictures.type.clip(0), pictures.face.clip(0)]
+    sd = outline * np.maximum(depth, 0.0)
+    turn = sd / np.maximum(np.linalg.norm(size, axis=-1) / 12**0.5, 1e-3)
+    x, y = pictures.x + sd * gauss[..., 0], pictures.y + sd * gauss[..., 1]
+    return pictures._replace(x=x, y=y, yaw=np.mod(pictures.yaw + turn * gauss[..., 2], 2 * np.pi))
+
+
+class _Slots(NamedTuple):
+    """Objects of S samples; type -1 where there is none."""
+
+    type: Int[np.ndarray, "S M"]
+    face: Int[np.ndarray, "S M"]
+    T_camera_object: Float[np.ndarray, "S M 4 4"]
+    size: Float[np.ndarray, "S M 3"]  # metres; 0 of library types
+
+
+def _with_things(
+    known: _Slots,
+    count: Int[np.ndarray, "S"],
+    things: Sequence[tuple[UnknownThing, ...]],
+    unknown_type: int,
+    T_camera_table: Float[np.ndarray, "S 4 4"],
+) -> _Slots:
+    """Things of no type in the slots after the known objects of each sample."""
+    most = max((len(t) for t in things), default=0)
+    needed = max((int(n) + len(t) for n, t in zip(count, things, strict=True)), default=0)
+    grown = max(needed, known.type.shape[1])
+    if most == 0 or grown == 0:
+        return known
+    more = grown - known.type.shape[1]
+    kind, face, size = (
+        np.pad(a, [(0, 0), (0, more)] + [(0, 0)] * (a.ndim - 2), constant_values=fill)
+        for a, fill in ((known.type, -1), (known.face, -1), (known.size, 0))
+    )
+    T = np.concatenate([known.T_camera_object, np.broadcast_to(np.eye(4), (len(kind), more, 4, 4))], 1)
+    for s, held in enumerate(things):
+        for k, thing in enumerate(held):
+            slot = int(count[s]) + k
+            # Shares of how far a thing goes on behind, evenly over the samples (the golden ratio's multiples).
+            size[s, slot], centre, yaw = drawn_box(thing, (0.6180339887 * s + 0.31 * k) % 1)
+            kind[s, slot] = unknown_type
+            T[s, slot] = T_camera_table[s] @ slide(*(np.array(a) for a in (*centre, yaw)))
+    return _Slots(kind, face, T, size)
+
+
+def _moved(table_error: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 1 4 4"]:
+    """The table's errors, two tilts and a height, as motions in its frame."""
     moved = np.broadcast_to(np.eye(4), (len(table_error), 1, 4, 4)).copy()
     moved[:, 0, :3, :3] = Rotation.from_rotvec(table_error * [1, 1, 0]).as_matrix()
     moved[:, 0, 2, 3] = table_error[:, 2]
-    along = slide(*(np.asarray(a) for a in (objects.x, objects.y, objects.yaw)))
-    return np.asarray(table.T_camera_table, np.float64) @ moved @ along @ T_contact
+    return moved
+
+
+def _T_table_object(objects: Placement, library: LibraryArrays) -> Float[np.ndarray, "S M 4 4"]:
+    """In float64 numpy: sample counts differ from frame to frame, and must not recompile."""
+    T_contact = np.asarray(library.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
+    return slide(*(np.asarray(a) for a in (objects.x, objects.y, objects.yaw))) @ T_contact

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal, near_peak, peak
+from bayes3d_ros.likelihood.image_model import ImageModel, gain, likeliest_noise, log_marginal
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, near_peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
@@ -170,7 +171,7 @@ def find_proposal(
     key: PRNGKeyArray,
     scene: LeadScene,
     context: Context,
-    grid: NoiseGrid,
+    model: ImageModel,
     table_size: tuple[float, float],
     window: int,
     overlap_limit: float,
@@ -178,7 +179,7 @@ def find_proposal(
     """The proposal for one more object, given the scene that stands for the population, and the exponents by which to
     go from it to the target."""
     image, library, table = context
-    noise = peak(scene.loglik_grid, grid)
+    noise = likeliest_noise(model, scene.loglik_grid)
     height, width = image.depth.shape
     half = window // 2
     shape = cell_grid(table_size)
@@ -190,7 +191,7 @@ def find_proposal(
     worth = best > SEARCH.worth_nats
     mixture, pilots = jax.lax.cond(
         worth,
-        lambda: _searched(key, found, rough, scene, context, grid, window),
+        lambda: _searched(key, found, rough, scene, context, model, window),
         lambda: _not_searched(found, library),
     )
     cells = hidden_cells(image, table, shape)
@@ -247,7 +248,7 @@ def _searched(
     rough: Gains,
     scene: LeadScene,
     context: Context,
-    grid: NoiseGrid,
+    model: ImageModel,
     window: int,
 ) -> tuple[Modes, Pilots]:
     """A mixture about the modes that are uphill of what was found, and the pilots that it was fitted to."""
@@ -259,34 +260,43 @@ def _searched(
     modes, value = best_first(modes, value, len(value))
     modes = _types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
     modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
+    if not isinstance(model, NoiseGrid):
+        # Against something unknown a wrong object may lose what it gains over the table: the model itself chooses.
+        _, marginal = _targets(take(modes.placement, jnp.argmax(value)[None]), scene, context, model, window)
+        value = marginal(modes.placement)
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
     modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
-    grid_then = _grid_with(take(modes.placement, slice(1)), scene, context, grid, window)
-    noise, near = peak(grid_then, grid), near_peak(grid_then, grid)
-    rows = jnp.searchsorted(grid.coarse.sigma, near.coarse.sigma)
-
-    def exact(placement: Placement) -> Float[Array, "N"]:
-        return _gains(placement, scene.depth, context, noise, window)
-
-    def marginal(placement: Placement) -> Float[Array, "N"]:
-        """What the sampler's weights will hold: the noise integrated out. Modes that explain different parts of the
-        image are compared by thousands of nats; at one noise level that comparison is off by ten."""
-        ancestor = jnp.zeros(placement.type.shape, jnp.int32)
-        gain = log_likelihood_gain(placement, ancestor, scene.depth[None], *context, near.coarse, window)
-        return log_marginal(scene.loglik_grid[rows] + gain, near)
-
+    exact, marginal = _targets(take(modes.placement, slice(1)), scene, context, model, window)
     modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, SEARCH.fit_rounds)
     mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
     return with_self_symmetry(mixture, exact, library), pilots
 
 
-def _grid_with(
-    first: Placement, scene: LeadScene, context: Context, grid: NoiseGrid, window: int
-) -> Float[Array, "S P"]:
-    """The scene's log likelihoods once one object [1] explains what it does."""
-    gain = log_likelihood_gain(first, jnp.zeros(1, jnp.int32), scene.depth[None], *context, grid.coarse, window)
-    return scene.loglik_grid + gain[0]
+def _targets(
+    first: Placement, scene: LeadScene, context: Context, model: ImageModel, window: int
+) -> tuple[Gains, Gains]:
+    """What modes are fitted to, at one noise level, and what the sampler's weights will hold: the errors' parameters
+    integrated out. Modes that explain different parts of the image are compared by thousands of nats; at one noise
+    level that comparison is off by ten. first [1]: an object that explains what there is to explain."""
+    grid_then = (
+        scene.loglik_grid + gain(model, first, jnp.zeros(1, jnp.int32), scene.depth[None], context, window)[0][0]
+    )
+    noise = likeliest_noise(model, grid_then)
+    part, rows = model, jnp.arange(len(scene.loglik_grid))
+    if isinstance(model, NoiseGrid):
+        part = near_peak(grid_then, model)
+        rows = jnp.searchsorted(model.coarse.sigma, part.coarse.sigma)
+
+    def exact(placement: Placement) -> Float[Array, "N"]:
+        return _gains(placement, scene.depth, context, noise, window)
+
+    def marginal(placement: Placement) -> Float[Array, "N"]:
+        ancestor = jnp.zeros(placement.type.shape, jnp.int32)
+        gained, _ = gain(part, placement, ancestor, scene.depth[None], context, window)
+        return log_marginal(part, scene.loglik_grid[rows] + gained)
+
+    return exact, marginal
 
 
 def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:

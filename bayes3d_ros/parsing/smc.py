@@ -23,9 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood import noise_marginal
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, render_objects
+from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
@@ -34,7 +32,7 @@ from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
-from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
+from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate, with_object
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample, systematic
@@ -47,7 +45,8 @@ class Population(NamedTuple):
     objects: Placement  # [N, M]
     solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
     lineage: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
-    scenes: Float[Array, "N Hp Wp"]  # padded depth
+    warp: Float[Array, "N M 3"]  # the error that an object's returns share, see `image_model.gain`
+    scenes: Float[Array, "N Hp Wp"]  # padded depth, as the camera shows it: with these errors
     loglik_grid: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
     log_likelihood: Float[Array, "N"]  # noise integrated out
     log_weight: Float[Array, "N"]  # normalised
@@ -64,10 +63,10 @@ class StageInfo(NamedTuple):
 
 @partial(jax.jit, static_argnames=("particles", "max_objects", "table_size", "window"))
 def init(
-    context: Context, grid: NoiseGrid, particles: int, max_objects: int, table_size: tuple[float, float], window: int
+    context: Context, model: ImageModel, particles: int, max_objects: int, table_size: tuple[float, float], window: int
 ) -> Population:
     """The empty table."""
-    empty = empty_table(context, grid, window)
+    empty = empty_table(context, model, window)
     slots = (particles, max_objects)
     none, zero = jnp.full(slots, -1, jnp.int32), jnp.zeros(slots)
     none_yet = jnp.full((max_objects, COMPONENTS), -1, jnp.int32)
@@ -79,6 +78,7 @@ def init(
         objects=Placement(none, none, zero, zero, zero),
         solo_gain=zero,
         lineage=none,
+        warp=jnp.zeros((*slots, 3)),
         scenes=everywhere(empty.scene),
         loglik_grid=everywhere(empty.loglik_grid),
         log_likelihood=everywhere(empty.log_likelihood),
@@ -103,7 +103,7 @@ def step(
     state: Population,
     count: Int[Array, ""],
     context: Context,
-    grid: NoiseGrid,
+    model: ImageModel,
     table_size: tuple[float, float],
     window: int,
     ess_threshold: float,
@@ -115,18 +115,19 @@ def step(
     ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     scene = _lead(state, ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])], count)
-    proposal, exponents = find_proposal(search_key, scene, context, grid, table_size, window, OVERLAP_LIMIT)
+    proposal, exponents = find_proposal(search_key, scene, context, model, table_size, window, OVERLAP_LIMIT)
 
     def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
-        gain = log_likelihood_gain(new, ancestor, state.scenes, *context, grid.coarse, window)
-        summed = state.loglik_grid[ancestor] + gain
-        log_likelihood = noise_marginal.log_marginal(summed, grid)
+        gained, warp = gain(model, new, ancestor, state.scenes, context, window)
+        summed = state.loglik_grid[ancestor] + gained
+        log_likelihood = log_marginal(model, summed)
         log_q = log_density(new, proposal, library, table)
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
-        return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, lineage=jnp.arange(len(ancestor)))
+        lineage = jnp.arange(len(ancestor))
+        return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, warp, lineage)
 
     def move(key: PRNGKeyArray, at: Proposed, b: Float[Array, ""], which: Int[Array, ""]) -> Proposed:
         return move_new(key, at, b, which, extend, proposal, library, table)
@@ -137,18 +138,18 @@ def step(
     end, log_weight, log_evidence, ess = _anneal(
         anneal_key, start, log_weight, particles, exponents, move, ess_threshold
     )
-    own = _own_gain(end, state, count, context, grid, window)
+    own = _own_gain(end, state, count, context, model, window)
     solo_gain = state.solo_gain[end.ancestor].at[:, count].set(own)
     log_weight, last = normalised(log_weight + log_last(solo_gain, count))
     ess = jnp.minimum(ess, effective_fraction(log_weight))
     objects = jax.tree.map(lambda a, b: a[end.ancestor].at[:, count].set(b), state.objects, end.new)
-    lineage = state.lineage[end.ancestor].at[:, count].set(end.lineage)
-    scenes = render_objects(end.new, state.scenes[end.ancestor], *context, window)
+    scenes = with_object(end.new, end.warp, state.scenes[end.ancestor], context, window)
     proposals = jax.tree.map(lambda a, b: a.at[count].set(b), state.proposals, proposal)
     return Population(
         objects=objects,
         solo_gain=solo_gain,
-        lineage=lineage,
+        lineage=state.lineage[end.ancestor].at[:, count].set(end.lineage),
+        warp=state.warp[end.ancestor].at[:, count].set(end.warp),
         scenes=scenes,
         loglik_grid=end.loglik_grid,
         log_likelihood=end.log_likelihood,
@@ -160,13 +161,13 @@ def step(
 
 
 def _own_gain(
-    end: Proposed, state: Population, count: Int[Array, ""], context: Context, grid: NoiseGrid, window: int
+    end: Proposed, state: Population, count: Int[Array, ""], context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N"]:
     """Nats that each new object alone gains over the empty table."""
     return jax.lax.cond(
         count == 0,
         lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
-        lambda: solo_gain_of(end.new, state.empty, context, grid, window),
+        lambda: solo_gain_of(end.new, state.empty, context, model, window),
     )
 
 
@@ -180,14 +181,14 @@ def refresh(
     state: Population,
     count: Int[Array, ""],
     context: Context,
-    grid: NoiseGrid,
+    model: ImageModel,
     window: int,
     ess_threshold: float,
     effort: Effort,
 ) -> Population:
     """The same posterior of scenes of `count` objects, some of them moved."""
     scenes = WeightedScenes(*(getattr(state, name) for name in WeightedScenes._fields))
-    frame = GivenFrame(context, grid, state.empty, window, OVERLAP_LIMIT, ess_threshold)
+    frame = GivenFrame(context, model, state.empty, window, OVERLAP_LIMIT, ess_threshold)
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 

@@ -48,6 +48,9 @@ class SearchTuning(NamedTuple):
     repeated_nats: float = 4.0  # a further pose of a type at a place counts less by; mug or cup, two bricks (exactness)
     least_sigma: float = 0.002  # metres: at less, candidates a pixel beside the peak score as misses; not recorded
     worth_nats: float = 5.0  # below, no candidate is worth a search; not recorded
+    # Share of a pixel's log likelihood that counts where a search scores pixels as if they erred independently: about
+    # ten share an error. What was chosen here was chosen with it.
+    pixel_weight: float = 0.1
     # Alignment (`alignment.py`)
     align_rounds: int = 10  # not recorded
     align_first_tolerance: float = 0.02  # metres, how far off a point may be; not recorded

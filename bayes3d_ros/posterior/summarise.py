@@ -8,16 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.posterior.matching import same_objects
 from bayes3d_ros.posterior.pose_statistics import PoseStatistics, pose_statistics
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, SceneSamples
 
+_UNKNOWN_RADIUS = 0.05  # metres: half of the middle side of an unknown thing's box, where samples are matched
 ANGLE_LENGTH = 0.05  # metres a radian counts for when poses are compared
 
 POSTERIOR_FIELDS = (
     *((name, np.float32) for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma")),
     *((name, np.int32) for name in ("sample", "n", "object", "type", "face")),
+    *((name, np.float32) for name in ("sx", "sy", "sz")),
 )
 
 
@@ -26,7 +28,8 @@ class Summary:
     """What the samples say. `objects[k]` stands in slot `slots[k]` of sample `reference`, the best scene.
 
     object_index: which object every slot holds: k < len(objects) for the listed ones, larger for all others, -1 for
-    none. num_objects: p(n). p_outlier, sigma (metres): posterior means.
+    none. num_objects: p(n); num_unknown: the same of those of no type in the library. p_outlier, sigma (metres):
+    posterior means.
     """
 
     reference: int
@@ -34,6 +37,7 @@ class Summary:
     object_index: Int[np.ndarray, "S M"]
     objects: tuple[ObjectEstimate, ...]
     num_objects: dict[int, float]
+    num_unknown: dict[int, float]
     p_outlier: float
     sigma: float
 
@@ -53,7 +57,7 @@ def summarise(
     if samples.log_weight.size == 0:
         raise ValueError("a posterior needs at least one sample")
     if samples.type.size and samples.type.max() >= len(types):
-        raise ValueError(f"samples hold type {samples.type.max()}, the library has {len(types)} types")
+        raise ValueError(f"samples hold type {samples.type.max()}, there are {len(types)} types")
     weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
     weights /= weights.sum()
     centre, radius = _centres(samples, library)
@@ -83,9 +87,18 @@ def summarise(
         object_index=relabel[index],
         objects=tuple(estimates[k] for k in listed),
         num_objects={n: float(weights[samples.num_objects == n].sum()) for n in range(samples.num_objects.max() + 1)},
+        num_unknown=number_of_unknown(samples, weights, types),
         p_outlier=float(weights @ samples.p_outlier),
         sigma=float(weights @ samples.sigma),
     )
+
+
+def number_of_unknown(
+    samples: SceneSamples, weights: Float[np.ndarray, "S"], types: tuple[str, ...]
+) -> dict[int, float]:
+    """p(number of objects of no type in the library)."""
+    count = (samples.type == types.index(UNKNOWN)).sum(1) if UNKNOWN in types else np.zeros(len(weights), int)
+    return {n: float(weights[count == n].sum()) for n in range(int(count.max(initial=0)) + 1)}
 
 
 def object_estimates(
@@ -130,6 +143,9 @@ def posterior_rows(samples: SceneSamples, object_index: Int[np.ndarray, "S M"]) 
             rows[name][object_], rows[name][none] = values[(*place, k)], np.nan
     for name, whole in (("object", object_index), ("type", samples.type), ("face", samples.face)):
         rows[name][object_], rows[name][none] = whole[place], -1
+    if samples.size is not None:
+        for k, name in enumerate(("sx", "sy", "sz")):
+            rows[name][object_] = samples.size[(*place, k)]
     return rows
 
 
@@ -139,12 +155,16 @@ def _centres(
     """Centres of the boxes, and half of the middle side of every type's box; origins where sizes are unknown."""
     if library is None or samples.type.size == 0:
         return samples.position.astype(float), None
-    box_centre = np.stack([m.T_object_box[:3, 3] for m in library.models])[samples.type]
+    # Of an unknown thing the origin is at the centre of the base.
+    box_centre = np.stack([*(m.T_object_box[:3, 3] for m in library.models), np.zeros(3)])[samples.type]
+    if samples.size is not None:
+        unknown = samples.type == len(library.models)
+        box_centre = np.where(unknown[..., None], samples.size * [0, 0, 0.5], box_centre)
     # Empty slots may hold any numbers; an identity keeps them finite and harmless.
     quaternion = np.where((samples.type >= 0)[..., None], samples.orientation, [0.0, 0.0, 0.0, 1.0])
     turned = Rotation.from_quat(quaternion.reshape(-1, 4)).apply(box_centre.reshape(-1, 3))
     return samples.position + turned.reshape(box_centre.shape), np.array(
-        [np.median(m.box_size) / 2 for m in library.models]
+        [*(np.median(m.box_size) / 2 for m in library.models), _UNKNOWN_RADIUS]
     )
 
 
@@ -221,6 +241,7 @@ def _estimate(
     sample, slot = np.nonzero(of_type)
     by_face = np.bincount(samples.face[sample, slot].clip(0), weights[sample], minlength=6)
     ranked = sorted(np.flatnonzero(by_type).tolist(), key=lambda t: (-by_type[t], t))
+    mean_size = _size(samples, weights, sample, slot, types[ranked[0]])
     return ObjectEstimate(
         type=types[ranked[0]],
         type_probabilities={types[t]: float(by_type[t] / by_type.sum()) for t in ranked},
@@ -228,10 +249,28 @@ def _estimate(
         position=pose.position,
         orientation=pose.orientation,
         covariance=pose.covariance,
-        contact_face=pose.modes[0].contact_face,
+        contact_face=-1 if types[ranked[0]] == UNKNOWN else pose.modes[0].contact_face,
         modes=pose.modes,
-        face_probabilities=tuple(float(p) for p in by_face / by_face.sum()),
+        face_probabilities=() if types[ranked[0]] == UNKNOWN else tuple(float(p) for p in by_face / by_face.sum()),
+        size=None if mean_size is None else mean_size[0],
+        size_sigma=None if mean_size is None else mean_size[1],
     )
+
+
+def _size(
+    samples: SceneSamples,
+    weights: Float[np.ndarray, "S"],
+    sample: Int[np.ndarray, "K"],
+    slot: Int[np.ndarray, "K"],
+    name: str,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+    """Of an unknown thing: mean and standard deviation of its box's sides."""
+    if name != UNKNOWN or samples.size is None:
+        return None
+    share = weights[sample] / weights[sample].sum()
+    mean = share @ samples.size[sample, slot].astype(float)
+    spread = share @ np.square(samples.size[sample, slot] - mean)
+    return mean, np.sqrt(spread)
 
 
 def _pose(samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[np.ndarray, "S M"]) -> PoseStatistics:

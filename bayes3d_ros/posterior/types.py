@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayes3d_ros.objects.model import UNKNOWN
+
 # Of the pixels on the table. Three objects on a bundled table, pixels missing at random: all are found with 0.4 usable,
 # one is taken for another type with 0.36, one is missed with 0.33, and with 0.29 the table passes for empty, p 0.98.
 FEWEST_USABLE = 0.4
@@ -19,12 +21,13 @@ class SceneSamples(NamedTuple):
 
     log_weight: Float[np.ndarray, "S"]  # normalised: exp sums to one
     num_objects: Int[np.ndarray, "S"]
-    type: Int[np.ndarray, "S M"]  # index into the library, -1 where there is no object
-    face: Int[np.ndarray, "S M"]  # contact face 0..5, -1 where there is no object
+    type: Int[np.ndarray, "S M"]  # index into the library, one past it: unknown; -1 where there is no object
+    face: Int[np.ndarray, "S M"]  # contact face 0..5, -1 where there is no object, and of an unknown thing
     position: Float[np.ndarray, "S M 3"]
     orientation: Float[np.ndarray, "S M 4"]  # quaternion x y z w
     p_outlier: Float[np.ndarray, "S"]
     sigma: Float[np.ndarray, "S"]  # metres, a standard deviation
+    size: Float[np.ndarray, "S M 3"] | None = None  # metres, of the boxes of unknown things; 0 of library types
 
 
 class PoseMode(NamedTuple):
@@ -52,12 +55,21 @@ class ObjectEstimate:
     position: Float[np.ndarray, "3"]  # T_camera_object
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
     covariance: Float[np.ndarray, "6 6"]  # x y z, then delta in R = Exp(delta) R_mean, on the camera's axes
-    contact_face: int  # of the heaviest mode
+    contact_face: int  # of the heaviest mode; -1 of an unknown thing
     modes: tuple[PoseMode, ...] = ()  # heaviest first; empty where they were not worked out
     face_probabilities: tuple[float, ...] = ()  # p(face 0) .. p(face 5); empty likewise
     # Of its visible scored pixels that returned, the share whose return is where the best scene puts it; NaN where
     # there are none, or where it was not worked out.
     explained: float = float("nan")
+    # Of an unknown thing: its box's sides along x, y and z of its frame (z up, origin at the centre of the base), and
+    # their standard deviations, metres.
+    size: Float[np.ndarray, "3"] | None = None
+    size_sigma: Float[np.ndarray, "3"] | None = None
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether it is most probably of no type in the library."""
+        return self.type == UNKNOWN
 
 
 class UnexplainedPlace(NamedTuple):
@@ -93,6 +105,11 @@ class ScenePosterior:
     # where it is not known. Where it is too low, `notes` says so.
     usable_share: float = float("nan")
     unexplained: tuple[UnexplainedPlace, ...] = ()  # most returns first
+    room: int | None = None  # most objects that a scene may hold; None: it does not matter
+    num_unknown: dict[int, float] = field(default_factory=dict)  # p(number of objects of no type in the library)
+    # What returned from unknown things of the best scene: x y z in the camera, metres, and which of `objects`.
+    unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     @property
     def too_little_usable(self) -> bool:
@@ -102,13 +119,19 @@ class ScenePosterior:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Those of the notes without which the posterior would be misread, worst first."""
-        return warning_notes(self.usable_share, self.unexplained)
+        full = self.room is not None and len(self.objects) >= self.room
+        return warning_notes(self.usable_share, self.unexplained, full)
 
 
-def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace]) -> tuple[str, ...]:
-    """What nobody should read a posterior without, worst first."""
+def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace], full: bool = False) -> tuple[str, ...]:
+    """What nobody should read a posterior without, worst first; full: whether no more objects would have room."""
     usable = (usable_note(usable_share),) if usable_share < FEWEST_USABLE else ()
-    return (*usable, *((unexplained_note(unexplained),) if unexplained else ()))
+    bound = ("the scene holds max_objects objects, and something is unexplained: there may be more",)
+    return (
+        *usable,
+        *(bound if full and unexplained else ()),
+        *((unexplained_note(unexplained),) if unexplained else ()),
+    )
 
 
 def usable_note(share: float) -> str:

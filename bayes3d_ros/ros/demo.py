@@ -47,6 +47,7 @@ OUTPUTS: dict[str, type] = {
     "segmentation": Image,
     "depth_reconstruction": Image,
     "posterior": PointCloud2,
+    "unknown_points": PointCloud2,
     "summary": DiagnosticArray,
 }
 PARSE_SECONDS = 120.0

@@ -12,7 +12,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bayes3d_ros.objects.model import Library, ObjectModel
-from bayes3d_ros.posterior.types import ScenePosterior
+from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior
 from bayes3d_ros.ros.to_messages import header, pose_message
 
 _TEXT_HEIGHT = 0.02  # metres
@@ -28,19 +28,19 @@ class SceneMarkers:
     def __call__(self, posterior: ScenePosterior) -> MarkerArray:
         """Markers of one scene; the first one deletes all that were shown before. Ids are labels.
 
-        Namespaces: `voxels` (surface voxels), `names` (type and p(exists)), `uncertainty` (ellipsoid of two standard
-        deviations of the position), `modes` (voxels at the other modes of the pose, the lighter the fainter).
+        Namespaces: `voxels` (surface voxels), `unknown` (boxes of unknown things), `names` (type and p(exists)),
+        `uncertainty` (ellipsoid of two standard deviations of the position), `modes` (voxels at the other modes of the
+        pose, the lighter the fainter).
         """
         markers = [Marker(header=header(posterior), action=Marker.DELETEALL)]
         for label, estimate in enumerate(posterior.objects, start=1):
             pose = pose_message(estimate.position, estimate.orientation)
-            voxels = Marker(type=Marker.CUBE_LIST, pose=pose, color=label_colour(label, 0.8))
-            model = self._models[estimate.type]
-            voxels.scale = Vector3(x=model.voxel_size, y=model.voxel_size, z=model.voxel_size)
-            voxels.points = self._voxels[estimate.type]
+            solid = self._solid(estimate, label)
+            solid.pose = pose
+            side = _longest_side(estimate, self._models)
 
             name = Marker(type=Marker.TEXT_VIEW_FACING, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
-            above = estimate.position - [0.0, 0.5 * float(np.max(model.box_size)) + _TEXT_HEIGHT, 0.0]  # y points down
+            above = estimate.position - [0.0, 0.5 * side + _TEXT_HEIGHT, 0.0]  # y points down
             name.pose = pose_message(above, np.array([0.0, 0.0, 0.0, 1.0]))
             name.scale.z = _TEXT_HEIGHT
             name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
@@ -49,15 +49,36 @@ class SceneMarkers:
             spread = Marker(type=Marker.SPHERE, color=label_colour(label, 0.4))
             spread.pose = pose_message(estimate.position, orientation)
             spread.scale = Vector3(**dict(zip("xyz", (2 * 2 * axes).tolist(), strict=True)))
-            for namespace, marker in (("voxels", voxels), ("names", name), ("uncertainty", spread)):
+            for namespace, marker in (
+                ("unknown" if estimate.is_unknown else "voxels", solid),
+                ("names", name),
+                ("uncertainty", spread),
+            ):
                 marker.header, marker.ns, marker.id, marker.action = header(posterior), namespace, label, Marker.ADD
                 markers.append(marker)
-            for mode in estimate.modes[1:]:
-                other = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.8 * mode.weight), scale=voxels.scale)
-                other.pose, other.points = pose_message(mode.position, mode.orientation), voxels.points
+            for mode in () if estimate.is_unknown else estimate.modes[1:]:
+                other = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.8 * mode.weight), scale=solid.scale)
+                other.pose, other.points = pose_message(mode.position, mode.orientation), solid.points
                 other.header, other.ns, other.id, other.action = header(posterior), "modes", len(markers), Marker.ADD
                 markers.append(other)
         return MarkerArray(markers=markers)
+
+    def _solid(self, estimate: ObjectEstimate, label: int) -> Marker:
+        """Surface voxels of a model, or the mean box of an unknown thing, a translucent cube on its base."""
+        if estimate.size is None:
+            model = self._models[estimate.type]
+            voxels = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.8))
+            voxels.scale = Vector3(x=model.voxel_size, y=model.voxel_size, z=model.voxel_size)
+            voxels.points = self._voxels[estimate.type]
+            return voxels
+        x, y, z = (float(side) for side in estimate.size)
+        box = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.35), scale=Vector3(x=x, y=y, z=z))
+        box.points = [Point(x=0.0, y=0.0, z=z / 2)]
+        return box
+
+
+def _longest_side(estimate: ObjectEstimate, models: dict[str, ObjectModel]) -> float:
+    return float(np.max(models[estimate.type].box_size if estimate.size is None else estimate.size))
 
 
 def principal_axes(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import jax
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.model import Library, type_names
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.markers import SceneMarkers
 from bayes3d_ros.settings import ParserSettings
@@ -36,6 +36,11 @@ class ParserBundle(NamedTuple):
     parser: Parser
     markers: SceneMarkers
     backend: str
+
+
+def types_of(parser: Parser) -> tuple[str, ...]:
+    """Names of the types that `type` in ~/posterior counts."""
+    return type_names(parser.library, parser.settings.knows_unknown)
 
 
 def make_bundle(

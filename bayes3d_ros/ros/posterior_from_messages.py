@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bayes3d_ros.objects.model import Library
-from bayes3d_ros.posterior.summarise import object_estimates
+from bayes3d_ros.objects.model import UNKNOWN, Library
+from bayes3d_ros.posterior.summarise import number_of_unknown, object_estimates
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
 from bayes3d_ros.ros.from_messages import depth_from_image, labels_from_image, rows_from_cloud, stamp_to_ns
 from bayes3d_ros.ros.summary import UNEXPLAINED, place_from_words
@@ -30,14 +30,23 @@ def samples_from_rows(rows: np.ndarray) -> tuple[SceneSamples, np.ndarray]:
     slot = np.arange(len(rows)) - np.repeat(first, size)  # rows are in the order of samples
     kind, face, index = (np.full((count, most), -1) for _ in range(3))
     position, orientation = np.zeros((count, most, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, most, 1))
+    box = np.zeros((count, most, 3))
     held = rows["object"] >= 0
     where = np.repeat(np.arange(count), size)[held], slot[held]
     kind[where], face[where], index[where] = rows["type"][held], rows["face"][held], rows["object"][held]
     position[where] = np.stack([rows[name][held] for name in ("x", "y", "z")], -1)
     orientation[where] = np.stack([rows[name][held] for name in ("qx", "qy", "qz", "qw")], -1)
+    if "sx" in (rows.dtype.names or ()):  # older recordings know no unknown things
+        box[where] = np.stack([rows[name][held] for name in ("sx", "sy", "sz")], -1)
     per_sample = {name: rows[name][first] for name in ("log_weight", "p_outlier", "sigma")}
     samples = SceneSamples(
-        num_objects=rows["n"][first], type=kind, face=face, position=position, orientation=orientation, **per_sample
+        num_objects=rows["n"][first],
+        type=kind,
+        face=face,
+        position=position,
+        orientation=orientation,
+        size=box,
+        **per_sample,
     )
     return samples, index
 
@@ -52,14 +61,16 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     weights = np.exp(samples.log_weight.astype(float))
     scene, *told = messages["summary"].status
     values = {pair.key: pair.value for pair in scene.values}
-    objects = object_estimates(samples, object_index, library.names, len(messages["poses"].poses))
+    types = (*library.names, UNKNOWN) if "p n unknown" in values else library.names
+    objects = object_estimates(samples, object_index, types, len(messages["poses"].poses))
     explained = [next(float(pair.value) for pair in status.values if pair.key == "explained") for status in told]
     return ScenePosterior(
         stamp_ns=stamp_of(cloud),
         frame_id=cloud.header.frame_id,
-        types=library.names,
+        types=types,
         objects=tuple(replace(found, explained=share) for found, share in zip(objects, explained, strict=True)),
         num_objects={n: float(weights[samples.num_objects == n].sum()) for n in range(samples.num_objects.max() + 1)},
+        num_unknown=number_of_unknown(samples, weights, types),
         p_outlier=float(weights @ samples.p_outlier),
         sigma=float(weights @ samples.sigma),
         log_evidence=float(values["log evidence"]),

@@ -33,14 +33,15 @@ class ScenePublishers:
         self._segmentation = publisher(Image, "segmentation")
         self._reconstruction = publisher(Image, "depth_reconstruction")
         self._posterior = publisher(PointCloud2, "posterior")
+        self._unknown_points = publisher(PointCloud2, "unknown_points")
         self._summary = publisher(DiagnosticArray, "summary")
         self._library = publisher(String, "library", LATCHED)
         detections = detections_type()
         self._detections = None if detections is None else publisher(detections, "detections")
 
-    def library(self, library: Library) -> None:
+    def library(self, types: tuple[str, ...]) -> None:
         """Publish the names of the types."""
-        self._library.publish(to_messages.library_message(library.names))
+        self._library.publish(to_messages.library_message(types))
 
     def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers) -> None:
         """Publish a scene on every topic."""
@@ -48,6 +49,7 @@ class ScenePublishers:
         self._segmentation.publish(to_messages.segmentation_image(posterior))
         self._reconstruction.publish(to_messages.reconstruction_image(posterior))
         self._posterior.publish(to_messages.posterior_cloud(posterior))
+        self._unknown_points.publish(to_messages.unknown_cloud(posterior))
         if self._objects.get_subscription_count():  # thousands of points as Python objects
             self._objects.publish(markers(posterior))
         if self._detections is not None:

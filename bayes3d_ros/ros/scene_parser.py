@@ -25,7 +25,7 @@ from bayes3d_ros.ros.parameters import (
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
-from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle
+from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle, types_of
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
@@ -83,7 +83,7 @@ class SceneParserNode(Node):
         assert self._ready is not None
         result = super().on_activate(state)
         self._open_inputs()
-        self._outputs.library(self._ready.parser.library)
+        self._outputs.library(types_of(self._ready.parser))
         types = len(self._ready.parser.library.models)
         self.get_logger().info(f"active, {types} object types, inference on {self._ready.backend}")
         return result
@@ -167,7 +167,7 @@ class SceneParserNode(Node):
             return
         self.get_logger().info(f"parser ready after {seconds:.1f} s")
         if state == "active" and self._ready is not None:
-            self._outputs.library(self._ready.parser.library)
+            self._outputs.library(types_of(self._ready.parser))
         elif (
             state == "unconfigured"
             and self.get_parameter("autostart").value

@@ -24,6 +24,7 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     scene = DiagnosticStatus(level=level, name="scene", hardware_id=posterior.frame_id, message=names)
     scene.values = key_values(
         p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
+        p_n_unknown=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_unknown.items()),
         log_evidence=f"{posterior.log_evidence:.2f}",
         p_outlier=f"{posterior.p_outlier:.4f}",
         sigma_mm=f"{posterior.sigma * 1e3:.3f}",
@@ -60,10 +61,14 @@ def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> Diagn
         orientation_xyzw=spaced(estimate.orientation, 4),
         sigma_position_mm=sigma_position,
         sigma_rotation_deg=sigma_rotation,
-        contact_face=str(estimate.contact_face),
+        contact_face=str(estimate.contact_face) if estimate.contact_face >= 0 else "",
         p_face=" ".join(f"{face}: {p:.3f}" for face, p in enumerate(estimate.face_probabilities) if p >= 5e-4),
         p_mode=" ".join(f"{k}: {mode.weight:.3f}" for k, mode in enumerate(estimate.modes, start=1)),
     )
+    if estimate.size is not None and estimate.size_sigma is not None:
+        status.values += key_values(
+            size_m=spaced(estimate.size, 4), size_sigma_mm=spaced(np.asarray(estimate.size_sigma) * 1e3, 1)
+        )
     if len(estimate.modes) > 1:  # else it is what stands above
         status.values += [KeyValue(key=f"mode {k}", value=_mode(m)) for k, m in enumerate(estimate.modes, start=1)]
     return status

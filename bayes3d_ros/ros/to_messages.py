@@ -17,6 +17,7 @@ from bayes3d_ros.posterior.summarise import posterior_rows
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate
 
+_UNKNOWN_POINT = [("x", np.float32), ("y", np.float32), ("z", np.float32), ("object", np.int32)]
 POINT_TYPES = {np.dtype(np.float32): PointField.FLOAT32, np.dtype(np.int32): PointField.INT32}
 
 
@@ -96,6 +97,15 @@ def reconstruction_image(posterior: ScenePosterior) -> Image:
 def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
     """A point per object per sample; a sample without objects is one point with object = -1 (`posterior_rows`)."""
     return cloud_message(posterior_rows(posterior.samples, posterior.object_index), header(posterior))
+
+
+def unknown_cloud(posterior: ScenePosterior) -> PointCloud2:
+    """A point per return of an unknown thing of the best scene: x y z, and the object's index."""
+    rows = np.zeros(len(posterior.unknown_points), _UNKNOWN_POINT)
+    for k, name in enumerate(("x", "y", "z")):
+        rows[name] = posterior.unknown_points[:, k]
+    rows["object"] = posterior.unknown_object
+    return cloud_message(rows, header(posterior))
 
 
 def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:

@@ -2,23 +2,32 @@
 
 """What smooth depth errors do to a camera's pose, to first order.
 
-As for objects (`smooth_errors.py`): errors of real depth cameras are alike over many pixels, the likelihood takes
+Errors of real depth cameras are alike over many pixels, the likelihood takes
 pixels as independent and is then far too sure. The field f ~ GP(0, bias^2 + waviness^2 exp(-d^2 / 2 L^2)), d the
 distance between two points of a surface, moves the pose by (J^T J + R)^-1 J^T f, J the slopes of rendered depth along
 the pose's tangent. Its covariance is added to the filter's. The waves are a sum of random cosines with that
 kernel's spectrum (random Fourier features, Rahimi and Recht 2007), always the same ones.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bayes3d_ros.parsing.smooth_errors import SmoothError
 from bayes3d_ros.tracking.posterior_constants import HELD_SHARE
 
 _COSINES = 64  # that stand for the field; not recorded
 _FREQUENCIES = np.random.default_rng(0).normal(size=(_COSINES, 3)).astype(np.float32)
 _BLOCKED = 1e-9  # beside a sum of square slopes: no division by zero
+
+
+class SmoothError(NamedTuple):
+    """Standard deviations in metres, and the length of the waves in metres."""
+
+    bias: Float[Array, ""]
+    waviness: Float[Array, ""]
+    length: Float[Array, ""]
 
 
 def pose_covariance(

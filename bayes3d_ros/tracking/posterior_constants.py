@@ -14,7 +14,7 @@ NEAR_OBJECT = 0.08  # metres from an object's sphere in which a return may still
 
 # What smooth errors add to the covariance (`tracker.py`, `camera_errors.py`)
 STEEP = 5.0  # slope of depth against a shift, from which it is an outline's and no surface's
-OUTLINE_OFF_PIXELS = 0.1  # scored pixels, how far off outlines are (as in `smooth_errors.py`)
+OUTLINE_OFF_PIXELS = 0.1  # scored pixels, how far off outlines are
 OUTLINE_ARM = 0.03  # metres, that they hold a turn by at least
 HELD_SHARE = 1e-3  # of the mean square slope: a direction in which nothing moves stays where it is
 

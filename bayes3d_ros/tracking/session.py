@@ -82,5 +82,6 @@ class CameraFollower:
 def world_of(posterior: ScenePosterior, table_visible: bool) -> tuple[KnownWorld, Float[np.ndarray, "4 4"]]:
     """The objects of a parsed scene at rest in the table's frame, and T_world_camera."""
     T_world_camera = np.linalg.inv(posterior.T_camera_table)
-    placed = np.array([T_world_camera @ pose_matrix(o.position, o.orientation) for o in posterior.objects])
-    return KnownWorld(tuple(o.type for o in posterior.objects), placed.reshape(-1, 4, 4), table_visible), T_world_camera
+    known = [o for o in posterior.objects if not o.is_unknown]
+    placed = np.array([T_world_camera @ pose_matrix(o.position, o.orientation) for o in known])
+    return KnownWorld(tuple(o.type for o in known), placed.reshape(-1, 4, 4), table_visible), T_world_camera

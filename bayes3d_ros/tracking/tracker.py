@@ -23,12 +23,11 @@ from bayes3d_ros.likelihood.sharding import on_all
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.parser import frame_key
-from bayes3d_ros.parsing.smooth_errors import SmoothError
 from bayes3d_ros.posterior.pose_statistics import rotation_mean, second_moment
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking import marginal_filter
-from bayes3d_ros.tracking.camera_errors import pose_covariance
+from bayes3d_ros.tracking.camera_errors import SmoothError, pose_covariance
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.depth_alignment import TrackedScene, rendered_slopes
 from bayes3d_ros.tracking.posterior_constants import (

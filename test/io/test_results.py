@@ -13,12 +13,12 @@ from bayes3d_ros.posterior.summarise import posterior_rows
 
 TYPES = ("bowl", "can", "mug")
 KEYS = [
-    "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "noise", "objects",
+    "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "num_unknown", "noise", "objects",
     "T_camera_table", "ess", "usable_share", "unexplained", "notes",
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes", "explained",
+    "face_probabilities", "modes", "explained", "size", "size_sigma",
 ]  # fmt: skip
 
 

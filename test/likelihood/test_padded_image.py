@@ -50,7 +50,7 @@ def table():
     return Table(jnp.asarray(pose, jnp.float32), jnp.array([0.8, 0.8]))
 
 
-@pytest.fixture(scope="module", params=["depth", "points"])
+@pytest.fixture(scope="module", params=["independent", "points"])
 def images(request, table):
     """The same noisy table, with pixels of every kind, in arrays of the camera's rows and of more."""
     rng = np.random.default_rng(0)
@@ -102,7 +102,9 @@ def test_hypotheses_gain_the_same(images, placements, arrays, table, kernel):
         pytest.skip("free points are scored by tiles")
     tight, padded = (gains(kernel, placements, image, arrays, table) for image in (images.tight, images.padded))
     np.testing.assert_allclose(padded, tight, rtol=1e-6, atol=1e-5)
-    if images.padded.likelihood.name == "depth":  # what is rendered below the last row would be in that row's windows
+    if (
+        images.padded.likelihood.name == "independent"
+    ):  # what is rendered below the last row would be in that row's windows
         rendered_below = gains(kernel, placements, images.padded._replace(rows=None), arrays, table)
         assert np.abs(rendered_below - tight).max() > 0.1
 

@@ -74,8 +74,8 @@ def surface(height=9, width=10, rim=0):
 
 def test_every_likelihood_can_be_chosen():
     (field,) = (f for f in fields(ParserSettings) if f.name == "likelihood")
-    assert field.metadata["choices"] == tuple(likelihoods) and field.default == "depth"
-    with pytest.raises(ValueError, match="likelihood must be one of depth, points"):
+    assert field.metadata["choices"] == ("depth", *likelihoods) and field.default == "depth"
+    with pytest.raises(ValueError, match="likelihood must be one of depth, independent, points"):
         ParserSettings(likelihood="splats")
 
 
@@ -171,5 +171,5 @@ def test_on_depth_images_points_are_too_sure_of_the_noise(sigma):
     depth = (rendered + sigma / norm * rng.normal(size=rendered.shape))[..., None]
     pixels = {name: make_pixels(depth, likelihood=name, focal=focal) for name in likelihoods}
     found = {name: best_sigma(rendered, seen, sigma) for name, seen in pixels.items()}
-    assert found["depth"] == pytest.approx(sigma, rel=0.05)  # measured: 0.045
+    assert found["independent"] == pytest.approx(sigma, rel=0.05)  # measured: 0.045
     assert found["points"] == pytest.approx(sigma / np.sqrt(3), rel=0.03)  # 0.016

@@ -233,7 +233,7 @@ def test_a_window_counted_wrongly_is_caught(monkeypatch):
     enumeration would not notice, it scores with the same likelihood."""
     assert integral_over_depth() == pytest.approx(1, abs=1e-3)
     right = density.inlier_density
-    monkeypatch.setitem(density.likelihoods, "depth", lambda *a: 9 * right(*a))
+    monkeypatch.setitem(density.likelihoods, "independent", lambda *a: 9 * right(*a))
     assert integral_over_depth() > 2
 
 

@@ -9,6 +9,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.parsing.explanation import FEWEST_RETURNS, explain
 from bayes3d_ros.parsing.observe import Observation
+from bayes3d_ros.parsing.table_fit import SeenTable
 
 CAMERA = Intrinsics(100.0, 100.0, 39.5, 29.5, 80, 60)
 TABLE_DEPTH, TOP_DEPTH = 1.0, 0.9  # metres
@@ -19,7 +20,8 @@ BLOCK = slice(20, 30), slice(10, 20)
 
 def seen(depth: np.ndarray, pixel_class: np.ndarray | None = None) -> Observation:
     pixel_class = np.full(depth.shape, IN_WORKSPACE) if pixel_class is None else pixel_class
-    return Observation(None, None, CAMERA, depth, pixel_class, T_CAMERA_TABLE, 1.0, [])
+    table = SeenTable(T_CAMERA_TABLE, np.zeros(3), np.zeros(3))
+    return Observation(None, None, None, CAMERA, depth, pixel_class, table, 1.0, [])
 
 
 def bare() -> np.ndarray:

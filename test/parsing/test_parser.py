@@ -21,7 +21,7 @@ from bayes3d_ros.settings import ParserSettings
 CAMERA = Intrinsics(90.0, 90.0, 47.5, 35.5, 96, 72)
 SETTINGS = ParserSettings(
     score_width=96,
-    pixel_weight=1.0,
+    likelihood="independent",
     particles=48,
     max_objects=3,
     sigma_max=0.006,

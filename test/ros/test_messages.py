@@ -152,9 +152,11 @@ def scene(names: tuple[str, ...]) -> ScenePosterior:
 def test_the_posterior_cloud_holds_the_samples(library) -> None:
     posterior = scene(library.names)
     cloud = to_messages.posterior_cloud(posterior)
-    names = "x y z qx qy qz qw log_weight p_outlier sigma sample n object type face"
+    names = "x y z qx qy qz qw log_weight p_outlier sigma sample n object type face sx sy sz"
     assert " ".join(f.name for f in cloud.fields) == names
-    assert [f.datatype for f in cloud.fields] == [PointField.FLOAT32] * 10 + [PointField.INT32] * 5
+    assert [f.datatype for f in cloud.fields] == [PointField.FLOAT32] * 10 + [PointField.INT32] * 5 + [
+        PointField.FLOAT32
+    ] * 3
     assert len(cloud.data) == cloud.row_step == cloud.point_step * cloud.width
     rows = from_messages.rows_from_cloud(cloud)
     assert rows.dtype == np.dtype(list(POSTERIOR_FIELDS))

@@ -48,7 +48,7 @@ def test_a_bag_gives_every_output(ros, library_folder: Path, bag: Path) -> None:
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     parser = ros.start_parser(library_folder, warm_up_width=64, warm_up_height=48)
     ros.wait_for_diagnosis(diagnostics, "no publisher on /depth/image_rect")
-    assert [m.data for m in library] == ["brick\ncube"]  # latched: this subscription may be the later one
+    assert [m.data for m in library] == ["brick\ncube\nunknown"]  # latched: this subscription may be the later one
     player = ros.start("-m", "bayes3d_ros.ros.bag_player", str(bag), "--wait", "30", "--rate", "0.1")
     for name, messages in received.items():
         ros.wait_for(lambda m=messages: len(m) >= 3, f"three messages on {name}")

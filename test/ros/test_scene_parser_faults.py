@@ -233,10 +233,10 @@ def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, librar
     assert "brick.npz" in ros.call(Trigger, reload, Trigger.Request()).message
     shutil.copytree(library_folder, folder, dirs_exist_ok=True)
     assert ros.call(Trigger, reload, Trigger.Request()).success
-    ros.wait_for(lambda: names and names[-1].data == "brick\ncube", "the library")
+    ros.wait_for(lambda: names and names[-1].data == "brick\ncube\nunknown", "the library")
     (folder / "cube.npz").unlink()
     assert ros.call(Trigger, reload, Trigger.Request()).success
-    ros.wait_for(lambda: names[-1].data == "brick", "the smaller library")
+    ros.wait_for(lambda: names[-1].data == "brick\nunknown", "the smaller library")
 
     # A lifecycle manager can stop it and start it again.
     change = f"{name}/change_state"

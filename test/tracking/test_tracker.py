@@ -20,12 +20,11 @@ from bayes3d_ros.geometry.se3 import exp_about
 from bayes3d_ros.likelihood.camera_score import World, depth_along
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.parsing.smooth_errors import SmoothError
 from bayes3d_ros.posterior.types import ObjectEstimate
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking import marginal_filter
 from bayes3d_ros.tracking import tracker as module
-from bayes3d_ros.tracking.camera_errors import pose_covariance
+from bayes3d_ros.tracking.camera_errors import SmoothError, pose_covariance
 from bayes3d_ros.tracking.camera_estimate import KnownWorld, TrackingError
 from bayes3d_ros.tracking.relocalise import LookAt, over_table
 from bayes3d_ros.tracking.session import CameraFollower

@@ -71,7 +71,7 @@ def test_rows_are_json_and_of_their_scene_alone(problem, rows):
         assert calibration.line(row).count("\n") == 0
 
 
-@pytest.mark.parametrize("likelihood", ["depth", "points"])
+@pytest.mark.parametrize("likelihood", ["independent", "points"])
 def test_the_truth_is_scored_as_the_sampler_scores_it(problem, likelihood):
     """The likelihood of a scene drawn whole is that which the sampler sums object by object."""
     if likelihood == "points":

@@ -25,6 +25,7 @@ SOURCES = (
     "likelihood/cpu/*.py",
     "likelihood/density.py",
     "likelihood/march.py",
+    "likelihood/shared_errors.py",
     "likelihood/tiles.py",
     "objects/library_arrays.py",
     "parsing/coarse_search_cpu.py",

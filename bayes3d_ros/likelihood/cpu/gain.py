@@ -7,6 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.cpu.handlers import DEPTH_TARGET, GAIN_TARGET
@@ -94,7 +95,7 @@ def _whole(numbers: Array | Sequence) -> Int[Array, "n"]:
     return jnp.asarray(numbers, jnp.int32).ravel()
 
 
-def _real(numbers: Array | Sequence) -> Float[Array, "n"]:
+def _real(numbers: Array | np.ndarray | Sequence) -> Float[Array, "n"]:
     return jnp.asarray(numbers, jnp.float32).ravel()
 
 

@@ -47,7 +47,7 @@ def steps(quick: bool) -> Iterator[Step]:
     """A row a frame."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-additivity-") as folder:
         library = load_library(ycb_library(TEN_TYPES, Path(folder)))
-    settings = ParserSettings(fixed_objects=1, max_objects=1)
+    settings = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)
     whole = SceneParser(library, settings)
     each = [SceneParser(Library((model,)), settings) for model in library.models]
     for recording in recordings(quick=True):

@@ -42,12 +42,9 @@ __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 NOISE_MODELS: tuple[tuple[str, ParserSettings], ...] = (
     (
         "independent pixels",
-        ParserSettings(
-            pixel_weight=1.0, depth_bias=0.0, depth_waviness=0.0, table_height_sigma=0.0, table_tilt_sigma=0.0
-        ),
+        ParserSettings(likelihood="independent", image_bias=0.0, camera_position_sigma=0.0, camera_angle_sigma=0.0),
     ),
-    ("offset an object", ParserSettings(depth_waviness=0.0)),
-    ("smooth field", ParserSettings()),
+    ("shared errors", ParserSettings()),
 )
 COVERED_TYPES: tuple[str, ...] = tuple(SYMMETRIES)
 COVERAGE_SCENES, QUICK_COVERAGE_SCENES = 400, 40

@@ -73,7 +73,7 @@ def count(quick: bool) -> int:
 
 def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
-    settings = ParserSettings(fixed_objects=1, max_objects=1)
+    settings = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)
     with tempfile.TemporaryDirectory(prefix="bayes3d-planted-") as folder:
         library = load_library(ycb_library(TEN_TYPES, Path(folder)))
     parser, arrays = SceneParser(library, settings), library_arrays(library)

@@ -42,7 +42,7 @@ SETTINGS = ParserSettings(
     table_depth=0.3,
     near=0.2,
     far=1.0,
-    pixel_weight=1.0,  # images are drawn pixel by pixel
+    likelihood="independent",  # images are drawn pixel by pixel
     sigma_max=0.004,
     particles=192,
     rejuvenated_objects=2,
@@ -100,7 +100,6 @@ def small_problem(settings: ParserSettings = SETTINGS) -> CalibrationProblem:
         outlier_scale=jnp.float32(limits.outlier_scale),
         front_margin=jnp.float32(3 * settings.sigma_max),
         likelihood=Likelihood(settings.likelihood),
-        weight=jnp.float32(settings.pixel_weight),
     )
     table = Table(jnp.asarray(T_camera_table, jnp.float32), jnp.array(_table_size(settings), jnp.float32))
     log_count = np.arange(settings.max_objects + 1) * np.log(settings.count_ratio)

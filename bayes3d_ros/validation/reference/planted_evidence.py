@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, for_image, log_marginal, noise_grid
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, log_marginal, shared_errors
+from bayes3d_ros.likelihood.noise_marginal import for_image, noise_grid
+from bayes3d_ros.likelihood.scene_score import pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.context import Context
@@ -58,31 +59,38 @@ def planted_evidence(
     key: PRNGKeyArray, seen: Observation, library: LibraryArrays, settings: ParserSettings, truth: Placement
 ) -> PlantedEvidence:
     """Importance sampling about `truth` [1], on the image and with the settings that the parser has."""
-    context = Context(seen.image, library, seen.table)
-    grid = for_image(noise_grid(settings.sigma_max), seen.image, settings.window)
+    context = Context(jax.device_put(seen.image), library, seen.table)
+    model = model_of(seen, settings)
     spread = jnp.diag(jnp.array(_FIRST_SPREAD, jnp.float32))[None]
     modes = as_mixture(Hypotheses(truth, spread), jnp.zeros(1))
     best = PlantedEvidence(-np.inf, 0.0)
     for k in range(ROUNDS):
-        modes, log_evidence, ess = _round(jax.random.fold_in(key, k), modes, context, grid, settings.window)
+        modes, log_evidence, ess = _round(jax.random.fold_in(key, k), modes, context, model, settings.window)
         best = max(best, PlantedEvidence(float(log_evidence), float(ess)), key=lambda found: found.ess)
         if best.ess >= ENOUGH:
             break
     return best
 
 
+def model_of(seen: Observation, settings: ParserSettings) -> ImageModel:
+    """The model of an image that the parser has."""
+    if seen.errors is None:
+        return for_image(noise_grid(settings.sigma_max), seen.image, settings.window)
+    return shared_errors(seen.image, seen.errors)
+
+
 @partial(jax.jit, static_argnames="window")
 def _round(
-    key: PRNGKeyArray, modes: Modes, context: Context, grid: NoiseGrid, window: int
+    key: PRNGKeyArray, modes: Modes, context: Context, model: ImageModel, window: int
 ) -> tuple[Modes, Float[Array, ""], Float[Array, ""]]:
     """The mixture fitted to weighted draws from itself, the estimate that these give, and their effective number."""
     image, library, table = context
     wide = modes._replace(scale=_WIDER * modes.scale)
     draws = draw_modes(key, wide, DRAWS)
     bare = pad_scene(image.bare_depth, window)[None]
-    empty = log_likelihood_scene(bare, image, grid.coarse, window)
-    gain = log_likelihood_gain(draws, jnp.zeros(DRAWS, jnp.int32), bare, *context, grid.coarse, window)
-    log_target = log_marginal(empty + gain, grid) - log_marginal(empty, grid) + log_prior(draws, library, table)
+    empty = empty_likelihood(model, bare, image, window)
+    gained, _ = gain(model, draws, jnp.zeros(DRAWS, jnp.int32), bare, context, window)
+    log_target = log_marginal(model, empty + gained) - log_marginal(model, empty) + log_prior(draws, library, table)
     log_weight = log_target - jax.nn.logsumexp(log_density_modes(draws, wide), 1)
     relative = jnp.maximum(log_weight - log_weight.max(), -1e9)
     fitted = refit(draws, tempered(relative[None], 0.2 * DRAWS)[0], modes)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The two models of an image that the parser samples under: pixels that err independently (`NoiseGrid`), and errors
+that neighbours share (`SharedErrors`).
+
+Both hand out log likelihoods at nodes [S, P] of the errors' parameters, which add up from object to object, and
+integrate over the nodes."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from bayes3d_ros.likelihood import noise_marginal
+from bayes3d_ros.likelihood.backends import shared_kernel
+from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.hypotheses import SceneDepths
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
+from bayes3d_ros.likelihood.scene_score import hypotheses_of, log_likelihood_gain, log_likelihood_scene
+from bayes3d_ros.likelihood.scored_image import ScoredImage
+from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
+from bayes3d_ros.likelihood.slow_shared_errors import NOTHING, TABLE, log_density
+from bayes3d_ros.objects.library_arrays import LibraryArrays
+from bayes3d_ros.objects.placement import Placement, Table
+
+_LEAST_P = 1e-3  # of outliers, in a search
+
+
+class SharedErrors(NamedTuple):
+    """`shared_errors.py` for one image, and what the empty table's returns say of its nodes."""
+
+    image: SharedErrorImage
+    empty: Float[Array, "1 S TA"]  # up to a constant
+
+
+ImageModel = NoiseGrid | SharedErrors
+
+
+def shared_errors(image: ScoredImage, errors: SharedErrorImage) -> SharedErrors:
+    """Of an image of numpy arrays."""
+    bare = np.asarray(image.bare_depth)
+    empty = log_density(bare, np.where(np.isfinite(bare), TABLE, NOTHING), image, errors)
+    return SharedErrors(errors, (empty - empty.max())[None].astype(np.float32))
+
+
+def gain(
+    model: ImageModel,
+    placement: Placement,
+    ancestor: Int[Array, "N"],
+    scenes: Float[Array, "A Hp Wp"],
+    context: tuple[ScoredImage, LibraryArrays, Table],
+    window: int,
+) -> tuple[Float[Array, "N S P"], Float[Array, "N 3"]]:
+    """log p(image | scene and object) - log p(image | scene) at each node; and the error that the object's returns
+    share, at its mode: metres at the image's first pixel, and what a column and a row add."""
+    image, library, table = context
+    if isinstance(model, NoiseGrid):
+        alone = log_likelihood_gain(placement, ancestor, scenes, image, library, table, model.coarse, window)
+        return alone, jnp.zeros((len(ancestor), 3))
+    hypotheses = hypotheses_of(placement, library, table)
+    return shared_kernel()(hypotheses, SceneDepths(scenes, ancestor), image, library, model.image)
+
+
+def log_marginal(model: ImageModel, loglik_grid: Float[Array, "N S P"]) -> Float[Array, "N"]:
+    """The nodes integrated out."""
+    if isinstance(model, NoiseGrid):
+        return noise_marginal.log_marginal(loglik_grid, model)
+    return jax.nn.logsumexp(loglik_grid + model.image.nodes.log_weight, (-2, -1))
+
+
+def empty_likelihood(
+    model: ImageModel, scene: Float[Array, "1 Hp Wp"], image: ScoredImage, window: int
+) -> Float[Array, "1 S P"]:
+    """log p(image | empty table) at each node, up to a constant; scene: the bare table."""
+    if isinstance(model, NoiseGrid):
+        loglik_grid = log_likelihood_scene(scene, image, model.coarse, window)
+        return loglik_grid - loglik_grid.max()
+    return jnp.asarray(model.empty)
+
+
+def likeliest_noise(model: ImageModel, loglik_grid: Float[Array, "S P"]) -> Noise:
+    """The best node's noise, for searches at a single one; of shared errors with what they add to a return."""
+    if isinstance(model, NoiseGrid):
+        return noise_marginal.peak(loglik_grid, model)
+    nodes, amplitudes = model.image.nodes, model.image.amplitudes
+    best = jnp.argmax(loglik_grid.max(1))
+    sigma = jnp.sqrt(nodes.sigma[best] ** 2 + amplitudes.wave**2)
+    return Noise(sigma[None], jnp.maximum(nodes.p_outlier[best], _LEAST_P)[None])
+
+
+def sample_noise(key: PRNGKeyArray, model: ImageModel, loglik_grid: Float[Array, "N S P"]) -> Noise:
+    """sigma and p_outlier of each scene, given the image."""
+    if isinstance(model, NoiseGrid):
+        return noise_marginal.sample(key, loglik_grid, model)
+    nodes = model.image.nodes
+    log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1)
+    node = jax.random.categorical(key, log_mass)
+    return Noise(jnp.asarray(nodes.sigma)[node], jnp.asarray(nodes.p_outlier)[node])

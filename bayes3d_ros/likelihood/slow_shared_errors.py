@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The density of `shared_errors.py`, of whole scenes, in float64 and as the page says it: the reference of the kernel
+(`cpu/cells.py`), and what weighs the empty table, once a frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.special import logsumexp
+
+from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, LATERAL
+from bayes3d_ros.likelihood.scored_image import ScoredImage
+from bayes3d_ros.likelihood.shared_errors import (
+    BAD_DEPTH,
+    BAD_SPREAD,
+    BAD_WEIGHT,
+    LOST_DEPTH,
+    LOST_SHARE,
+    OUTLINE_NATS,
+    SEAM_DEPTH,
+    SEAM_NATS,
+    STEEPEST,
+    SharedErrorImage,
+)
+
+NOTHING, TABLE, OBJECT = 0, 1, 2  # labels of pixels: object k is OBJECT + k
+_STEPS, _REWEIGHTED = 5, 3
+_FEWEST_INLIERS = 0.5
+_SAME_MODE = 0.5  # standard deviations
+
+
+class CellModes(NamedTuple):
+    """A cell's log likelihood as a function of its offset b: two modes, and where all returns are outliers."""
+
+    height: Float[np.ndarray, "2 C"]  # -inf: no such mode
+    place: Float[np.ndarray, "2 C"]  # metres
+    curvature: Float[np.ndarray, "2 C"]  # 1 / metres^2
+    outliers: Float[np.ndarray, "C"]
+
+    def normal(self, mean: Float[np.ndarray, "*c"] | float, sd: float) -> Float[np.ndarray, "C"]:
+        """log of the integral over b ~ N(mean, sd^2)."""
+        spread = 1 + self.curvature * sd**2
+        apart = (self.place - mean) ** 2 * self.curvature / spread
+        return np.logaddexp(np.logaddexp.reduce(self.height - 0.5 * np.log(spread) - 0.5 * apart), self.outliers)
+
+    def bad(self) -> Float[np.ndarray, "C"]:
+        """The same over b uniform in the `BAD_DEPTH` towards the camera."""
+        within = (self.place < 0) & (self.place > -BAD_DEPTH)
+        width = 0.5 * np.log(2 * np.pi / np.maximum(self.curvature, 1e-12)) - np.log(BAD_DEPTH)
+        return np.logaddexp(np.logaddexp.reduce(np.where(within, self.height + width, -np.inf)), self.outliers)
+
+
+class SurfaceCells(NamedTuple):
+    """Residuals of C cells of at most K returns; beyond them `real` is false."""
+
+    residual: Float[np.ndarray, "C K"]  # metres: return - scene
+    precision: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
+    outlier: Float[np.ndarray, "C K"]  # density
+    lost: Float[np.ndarray, "C K"]  # density of a return near an outline that lies anywhere
+    real: Bool[np.ndarray, "C K"]
+    label: Int[np.ndarray, "C"]
+    middle: Float[np.ndarray, "C 2"]  # column and row
+
+
+def modes(cells: SurfaceCells, sigma: float, p: float) -> CellModes:
+    """From offset 0, and from the median residual, by expectation and maximisation."""
+    if not len(cells.residual):
+        none = np.zeros((2, 0))
+        return CellModes(none, none, none, np.zeros(0))
+    starts = (np.zeros(len(cells.residual)), np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1))
+    found = [_follow(cells, start, sigma, p) for start in starts]
+    height, place, curvature, inliers = (np.stack(a) for a in zip(*found, strict=True))
+    height = np.where(inliers > _FEWEST_INLIERS, height, -np.inf)
+    same = np.abs(place[0] - place[1]) * np.sqrt(curvature.min(0)) < _SAME_MODE
+    height[1] = np.where(same & np.isfinite(height[0]), -np.inf, height[1])
+    outliers = np.where(cells.real, np.log(np.where(cells.real, p * cells.outlier + cells.lost, 1)), 0).sum(1)
+    return CellModes(height, place, curvature, outliers)
+
+
+def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: float):
+    def parts(b):
+        inlier = np.exp(-0.5 * (cells.residual - b[:, None]) ** 2 * cells.precision / sigma**2)
+        inlier = (1 - p) * inlier * np.sqrt(cells.precision / (2 * np.pi)) / sigma
+        total = p * cells.outlier + cells.lost + inlier
+        return np.where(cells.real, inlier / total, 0), np.where(cells.real, np.log(np.where(cells.real, total, 1)), 0)
+
+    for _ in range(_STEPS):
+        share, _ = parts(b)
+        weight = share * cells.precision
+        b = np.where(share.sum(1) > 1e-6, (weight * cells.residual).sum(1) / np.maximum(weight.sum(1), 1e-12), b)
+    share, logs = parts(b)
+    return logs.sum(1), b, (share * cells.precision).sum(1) / sigma**2, share.sum(1)
+
+
+class _Pixels(NamedTuple):
+    """What each pixel is scored as."""
+
+    unknown: Bool[np.ndarray, "H W"]
+    edge: Bool[np.ndarray, "H W"]
+    cell: Bool[np.ndarray, "H W"]
+    near_outline: Bool[np.ndarray, "H W"]
+    hidden: Bool[np.ndarray, "H W"]  # saw beyond the workspace, through a surface
+
+
+def kinds_of_pixels(
+    depth: Float[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage
+) -> _Pixels:
+    """depth: of the scene, inf where there is nothing; label: NOTHING, TABLE or OBJECT + k."""
+    observed, pixel_class = np.asarray(image.depth, np.float64), np.asarray(image.pixel_class)
+    rows = np.arange(len(observed))[:, None] < image.own_rows
+    inside = (pixel_class == IN_WORKSPACE) & rows
+    unknown = inside & stands_in_front(observed, depth, label, errors.table_margin)
+    several = label == NOTHING
+    for dv, du in _around():
+        z, there = _shifted(depth, dv, du, np.inf), _shifted(label, dv, du, NOTHING)
+        apart = max(abs(dv) / float(image.focal[1]), abs(du) / float(image.focal[0]))
+        with np.errstate(invalid="ignore"):
+            steep = np.abs(z - depth) > STEEPEST * apart * depth
+        several = several | ((there != NOTHING) & ((there != label) | steep))
+    scored = inside & ~unknown
+    hidden = (pixel_class == BEYOND) & rows & (depth < observed + float(image.front_margin))
+    near = ndimage.binary_dilation(several & rows, np.ones((3, 3)))
+    return _Pixels(unknown, scored & several, scored & ~several, near, hidden)
+
+
+def stands_in_front(
+    observed: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    margin: Float[np.ndarray, "H W"],
+) -> Bool[np.ndarray, "H W"]:
+    """Returns nearer than the scene, and than any object in their window, by more than a margin, metres: of objects by
+    `BAD_DEPTH` more."""
+    front, beside_object = depth, np.zeros(depth.shape, bool)
+    for dv, du in _around():
+        of_object = _shifted(label, dv, du, NOTHING) >= OBJECT
+        front = np.minimum(front, np.where(of_object, _shifted(depth, dv, du, np.inf), np.inf))
+        beside_object |= of_object
+    return observed < front - margin - np.where(beside_object, BAD_DEPTH, 0.0)
+
+
+def _around() -> list[tuple[int, int]]:
+    return [(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)]
+
+
+def _shifted(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
+    grown = np.pad(a, 1, constant_values=nothing)
+    return grown[1 + dv : 1 + dv + a.shape[0], 1 + du : 1 + du + a.shape[1]]
+
+
+def cells_of(
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    kinds: _Pixels,
+    image: ScoredImage,
+    errors: SharedErrorImage,
+) -> SurfaceCells:
+    """Pixels of one surface in one block together."""
+    v, u = np.nonzero(kinds.cell)
+    block, across = int(errors.block), -(-depth.shape[1] // int(errors.block))
+    key = (label[v, u].astype(int) * 10**7) + v // block * across + u // block
+    order = np.argsort(key, kind="stable")
+    v, u, key = v[order], u[order], key[order]
+    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    slot = np.arange(len(key)) - first[which]
+    shape = (len(first), block**2)
+    rays = 1 + np.asarray(image.ray_x, np.float64)[u] ** 2 + np.asarray(image.ray_y, np.float64)[v] ** 2
+    observed = np.asarray(image.depth, np.float64)[v, u]
+
+    def spread(values, nothing=0.0):
+        table = np.full(shape, nothing)
+        table[which, slot] = values
+        return table
+
+    real = spread(np.ones(len(v))) > 0
+    count = np.maximum(real.sum(1), 1)
+    middle = np.stack([spread(u).sum(1) / count, spread(v).sum(1) / count], 1)
+    return SurfaceCells(
+        spread(observed - depth[v, u]),
+        spread(rays / errors.spread[v, u].astype(np.float64) ** 2, 1.0),
+        spread(float(image.outlier_scale) * observed**2, 1.0),
+        spread(np.where(kinds.near_outline[v, u], lost_density(errors), 0.0)),
+        real,
+        label[v, u][first],
+        middle,
+    )
+
+
+def log_edges(
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    edge: Bool[np.ndarray, "H W"],
+    image: ScoredImage,
+    errors: SharedErrorImage,
+    node: int,
+) -> Float[np.ndarray, "E"]:
+    """log density of each edge pixel's return."""
+    amplitudes, nodes = errors.amplitudes, errors.nodes
+    sigma, p = float(nodes.sigma[node]), float(nodes.p_outlier[node])
+    v, u = np.nonzero(edge)
+    a, b = np.asarray(image.ray_x, np.float64)[u], np.asarray(image.ray_y, np.float64)[v]
+    observed = np.asarray(image.depth, np.float64)[v, u]
+    norm2, outlier = 1 + a * a + b * b, float(image.outlier_scale) * observed**2
+    noise = sigma * errors.spread[v, u].astype(np.float64)
+    of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
+    of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
+    apart_: list[np.ndarray] = []
+    across_, inlier_, points_ = [], [], []
+    for dv, du in _around():
+        y = _shifted(depth, dv, du, np.inf)[v, u]
+        there = _shifted(label, dv, du, NOTHING)[v, u]
+        surface = np.isfinite(y)
+        y0 = np.where(surface, y, 0)
+        ex, ey = du / float(image.focal[0]), dv / float(image.focal[1])
+        apart_.append(np.where(surface, du**2 + dv**2, np.inf))
+        across_.append(np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf))
+        variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
+        off = observed - y0 * (1 + (ex * a + ey * b) / norm2)
+        inlier_.append(np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance))
+        points_.append(np.where(surface, y0, np.nan))
+    across, inlier, points = np.array(across_), np.array(inlier_), np.array(points_)
+    any_surface = np.isfinite(points).any(0)
+    nearest = np.where(any_surface, across.min(0), 0)
+    blur, apart = float(amplitudes.edge_blur), np.array(apart_)
+    weight = np.exp(-0.5 * (across - nearest) / noise**2) + LATERAL
+    if blur > 0:
+        weight = np.exp(-0.5 * (apart - np.where(any_surface, apart.min(0), 0)) / blur**2)
+    weight = np.where(np.isfinite(across), weight, 0)
+    mixture = (weight * inlier).sum(0) / np.where(any_surface, weight.sum(0), 1)
+    front = np.nanmin(np.where(any_surface, points, 0.0), 0)
+    back = np.maximum(np.nanmax(np.where(any_surface, points, 0.0), 0), front + 4 * noise)
+    between = np.where((observed > front) & (observed < back), 1 / (back - front), 0.0)
+    share = float(amplitudes.edge_share)
+    inside = np.where(any_surface, (1 - share) * mixture + share * between, outlier)
+    return np.log(p * outlier + np.where(any_surface, lost_density(errors), 0.0) + (1 - p) * inside)
+
+
+def lost_density(errors: SharedErrorImage) -> float:
+    """Of returns near outlines that lie anywhere, per metre."""
+    return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH
+
+
+def mask_nats(unknown: Bool[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage) -> float:
+    """Of the outlines of what is unknown: prior's nats, negative."""
+    observed = np.asarray(image.depth, np.float64)
+    inside = (np.asarray(image.pixel_class) == IN_WORKSPACE) & (np.arange(len(observed))[:, None] < image.own_rows)
+    total = 0.0
+    for axis in (0, 1):
+        one, other = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        sides = inside[one] & inside[other] & (unknown[one] != unknown[other])
+        known = np.where(unknown[one], label[other], label[one])
+        seam = sides & (known >= OBJECT) & (np.abs(observed[one] - observed[other]) < SEAM_DEPTH)
+        total -= OUTLINE_NATS * sides.sum() + SEAM_NATS * seam.sum()
+    return total
+
+
+def log_object(cells: SurfaceCells, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float) -> float:
+    """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
+    three reweighted steps."""
+    amplitudes = errors.amplitudes
+    found = modes(cells, float(errors.nodes.sigma[node]), float(errors.nodes.p_outlier[node]))
+    share, model = float(amplitudes.bad_share), scale * float(amplitudes.model)
+    bad = found.bad()
+
+    def log_cells(a, share, sd=model):
+        mean = phi @ a
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log1p(-share) + found.normal(mean, sd), np.log(share) + bad)
+
+    def log_all(a):
+        shares = [min(share * b, 0.9) for b in BAD_SPREAD]
+        return logsumexp([log_cells(a, s).sum() + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
+
+    middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
+    phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
+    bias2, wave2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.wave)) ** 2
+    if bias2 + wave2 == 0:
+        return log_all(np.zeros(3))
+    prior = np.array([bias2 + wave2, wave2 / float(amplitudes.length) ** 2, wave2 / float(amplitudes.length) ** 2])
+    prior = np.maximum(prior, 1e-12)
+    a = np.zeros(3)
+    for step in range(_REWEIGHTED):
+        sd = np.sqrt(model**2 + prior[0]) if step == 0 else model
+        information, pull = _information(found, phi, a, sd, share, bad)
+        a = np.linalg.solve(information + np.diag(1 / prior), pull)
+    information, pull = _information(found, phi, a, model, share, bad)
+    full = information + np.diag(1 / prior)
+    slope = pull - full @ a
+    return (
+        log_all(a)
+        - 0.5 * (a**2 / prior).sum()
+        - 0.5 * np.log(prior).sum()
+        - 0.5 * np.linalg.slogdet(full)[1]
+        + 0.5 * slope @ np.linalg.solve(full, slope)
+    )
+
+
+def _information(found: CellModes, phi, a, sd: float, share: float, bad):
+    """What the good cells tell of a: responsibilities of modes, given a."""
+    mean = phi @ a
+    spread = 1 + found.curvature * sd**2
+    term = found.height - 0.5 * np.log(spread) - 0.5 * (found.place - mean) ** 2 * found.curvature / spread
+    with np.errstate(divide="ignore"):
+        total = np.logaddexp(np.log1p(-share) + found.normal(mean, sd), np.log(share) + bad)
+    weight = np.exp(np.log1p(-share) + term - total) * found.curvature / spread
+    return np.einsum("kc,ca,cb->ab", weight, phi, phi), np.einsum("kc,kc,ca->a", weight, found.place, phi)
+
+
+def log_density(
+    depth: Float[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage
+) -> Float[np.ndarray, "S TA"]:
+    """log p(image | scene) at each node, up to a constant of the image. depth: metres, inf where there is nothing;
+    label: NOTHING, TABLE or OBJECT + k."""
+    depth = np.asarray(depth, np.float64)
+    kinds = kinds_of_pixels(depth, label, image, errors)
+    cells = cells_of(depth, label, kinds, image, errors)
+    nodes = errors.nodes
+    mask = mask_nats(kinds.unknown, label, image) if errors.amplitudes.unknown else 0.0
+    found = np.zeros((len(nodes.sigma), len(nodes.table), len(nodes.scale)))
+    table = _take(cells, cells.label == TABLE)
+    for s, (sigma, p) in enumerate(zip(nodes.sigma.astype(float), nodes.p_outlier.astype(float), strict=True)):
+        fixed = mask + errors.unknown[s][kinds.unknown].sum(dtype=np.float64) + kinds.hidden.sum() * np.log(p)
+        fixed += log_edges(depth, label, kinds.edge, image, errors, s).sum()
+        of_table = modes(table, sigma, p)
+        for t, sd in enumerate(nodes.table.astype(float)):
+            found[s, t] += fixed + of_table.normal(0.0, sd).sum()
+        for k in np.unique(cells.label[cells.label >= OBJECT]):
+            own = _take(cells, cells.label == k)
+            metres = depth[kinds.cell & (label == k)].mean() / float(image.focal[0])
+            for a, scale in enumerate(nodes.scale.astype(float)):
+                found[s, :, a] += log_object(own, s, scale, errors, metres)
+    return found.reshape(len(nodes.sigma), -1)
+
+
+def _take(cells: SurfaceCells, which: Bool[np.ndarray, "C"]) -> SurfaceCells:
+    return SurfaceCells(*(a[which] for a in cells))

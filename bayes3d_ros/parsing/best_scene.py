@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The best scene's objects, known and unknown, as they are drawn and handed out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayes3d_ros.geometry.camera import resize_nearest, unproject
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.poses import pose_matrix
+from bayes3d_ros.parsing.observe import Observation
+from bayes3d_ros.parsing.unknown_things import UnknownThing, things_image
+from bayes3d_ros.posterior.summarise import Summary
+from bayes3d_ros.posterior.types import SceneSamples
+
+
+@dataclass(frozen=True)
+class BestScene:
+    """The sample that stands for all: its slots hold known objects first, then things of type `unknown_type`."""
+
+    samples: SceneSamples
+    summary: Summary
+    things: tuple[UnknownThing, ...]
+    unknown_type: int
+
+    def known_objects(self) -> tuple[list[int], list[Float[np.ndarray, "4 4"]], list[int]]:
+        """Types, T_camera_object and labels (k + 1 of object k) of the listed objects of a type."""
+        samples, best = self.samples, self.summary.reference
+        listed = [(k + 1, slot) for k, slot in enumerate(self.summary.slots)]
+        known = [(k, slot) for k, slot in listed if samples.type[best, slot] != self.unknown_type]
+        kinds = [int(samples.type[best, slot]) for _, slot in known]
+        poses = [pose_matrix(samples.position[best, slot], samples.orientation[best, slot]) for _, slot in known]
+        return kinds, poses, [k for k, _ in known]
+
+    def labels_of_things(self) -> Int[np.ndarray, "T1"]:
+        """Of thing t its label, k + 1 of object k, at t + 1; 0 where it is not listed."""
+        kinds = self.samples.type[self.summary.reference]
+        first = int((kinds >= 0).sum()) - len(self.things)
+        labels = np.zeros(len(self.things) + 1, np.int32)
+        for k, slot in enumerate(self.summary.slots):
+            if kinds[slot] == self.unknown_type:
+                labels[slot - first + 1] = k + 1
+        return labels
+
+    def with_things(
+        self,
+        frame: DepthFrame,
+        seen: Observation,
+        depth: Float[np.ndarray, "height width"],
+        label: Int[np.ndarray, "height width"],
+    ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
+        """Depth and labels of a rendered scene with the listed things in it: where one was seen, its depth is what
+        returned from it."""
+        if not self.things:
+            return depth, label
+        shown = self.labels_of_things()[things_image(self.things, seen.depth.shape)]
+        intrinsics = frame.intrinsics
+        shown = resize_nearest(shown, intrinsics.width, intrinsics.height)
+        with np.errstate(invalid="ignore"):
+            nearer = (shown > 0) & np.isfinite(frame.depth) & ~(frame.depth > depth)
+        return (
+            np.where(nearer, frame.depth, depth).astype(np.float32),
+            np.where(nearer, shown, label).astype(np.uint16),
+        )
+
+    def unknown_returns(self, seen: Observation) -> dict[str, np.ndarray]:
+        """Scored returns of the listed things: x y z in the camera, metres, and which object."""
+        shown = self.labels_of_things()[things_image(self.things, seen.depth.shape)]
+        where = shown > 0
+        return {
+            "unknown_points": unproject(seen.depth, seen.camera)[where].astype(np.float32),
+            "unknown_object": (shown[where] - 1).astype(np.int32),
+        }

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Things of no type in the library, in scenes of known objects.
+
+The likelihood scores returns in front of a scene as those of something unknown (`likelihood/shared_errors.py`). Each
+connected region of them is a thing, or outliers:
+
+    log odds = sum over its returns of (log of the unknown surface's density - log of outliers') - outline's nats
+               + log(count_ratio P(unknown)),
+
+the last being the prior of one more thing. Of a thing the box is told: upright, about what is seen, on the table. How
+far it goes on behind is uniform between the depth that is seen and the larger of the sides that are.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.special import expit
+
+from bayes3d_ros.geometry.camera import unproject
+from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.likelihood.shared_errors import OUTLINE_NATS
+from bayes3d_ros.likelihood.slow_shared_errors import NOTHING, OBJECT, TABLE, stands_in_front
+from bayes3d_ros.parsing.observe import Observation
+from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
+from bayes3d_ros.parsing.support_plane import connected_pieces
+
+_EIGHT = np.ones((3, 3))  # pixels that touch at a corner are of one thing
+_BRIDGED = 2  # pixels without a return, across which a thing goes on
+_LEAST_SIDE = 0.005  # metres: a box has no side of nothing
+
+
+class UnknownThing(NamedTuple):
+    """A region of returns and what it tells. Table frame, metres; yaw in [0, pi/2)."""
+
+    pixels: Int[np.ndarray, "P"]  # places in the image that is scored
+    log_gain: float  # nats over outliers, without the prior of one more thing
+    size: Float[np.ndarray, "3"]  # that is seen: along the box's x and y, and height
+    centre: Float[np.ndarray, "2"]
+    yaw: float
+    behind: Float[
+        np.ndarray, "3"
+    ]  # side along which it may go on (0 x, 1 y), towards which end (-1, 1), how far at most
+
+
+class ThingsOfScenes(NamedTuple):
+    """Of N scenes: the things that each holds, and what they add to the log weight."""
+
+    held: list[tuple[UnknownThing, ...]]
+    log_weight: Float[np.ndarray, "N"]
+
+
+def find_things(
+    scenes: Float[np.ndarray, "N H W"],
+    seen: Observation,
+    log_prior: float,
+    room: int,
+    exactly: bool,
+    seed: int,
+) -> ThingsOfScenes:
+    """scenes: depth as the camera shows it; log_prior: of one more thing; room: how many things a scene may hold at
+    most, or exactly: then those with the best odds."""
+    rng = np.random.default_rng(seed)
+    known: dict[bytes, tuple[UnknownThing, ...]] = {}
+    held, log_weight = [], np.zeros(len(scenes))
+    for n, depth in enumerate(scenes):
+        mask = in_front(depth, seen)
+        key = np.packbits(mask).tobytes()
+        if key not in known:
+            known[key] = _things(mask, seen)
+        here: list[UnknownThing] = []
+        for thing in sorted(known[key], key=lambda thing: -thing.log_gain):
+            odds, full = thing.log_gain + log_prior, len(here) >= room
+            # The likelihood counts its gain. In its place stands that of a thing, or of outliers, or of either.
+            either = odds if exactly else float(np.logaddexp(odds, 0.0))
+            log_weight[n] += (0.0 if full else either) - thing.log_gain
+            if not full and (exactly or rng.uniform() < expit(odds)):
+                here.append(thing)
+        if exactly and len(here) < room:
+            log_weight[n] = -np.inf
+        held.append(tuple(here))
+    return ThingsOfScenes(held, log_weight)
+
+
+def in_front(depth: Float[np.ndarray, "H W"], seen: Observation) -> Bool[np.ndarray, "h w"]:
+    """Returns that stand in front of a scene by more than a margin, as the likelihood has it."""
+    errors = seen.errors
+    assert errors is not None
+    height, width = seen.depth.shape
+    depth, bare = depth[:height, :width], np.asarray(seen.image.bare_depth)[:height, :width]
+    label = np.where(depth == bare, TABLE, np.where(np.isfinite(depth), OBJECT, NOTHING))
+    front = stands_in_front(seen.depth, depth, label, errors.table_margin[:height, :width])
+    return (seen.pixel_class == IN_WORKSPACE) & front
+
+
+def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownThing, ...]:
+    """Most returns first."""
+    errors = seen.errors
+    assert errors is not None
+    node = len(errors.nodes.sigma) // 2
+    height, width = mask.shape
+    outlier = float(np.asarray(seen.image.outlier_scale)) * np.maximum(seen.depth, 1e-6) ** 2
+    gain = errors.unknown[node, :height, :width] - np.log(float(errors.nodes.p_outlier[node]) * outlier)
+    T = seen.T_camera_table
+    points = (unproject(np.where(mask, seen.depth, np.nan), seen.camera) - T[:3, 3]) @ T[:3, :3]
+    regions, count = _regions(mask, seen.depth, seen.pixel_class != NO_RETURN, points)
+    if count == 0:
+        return ()
+    inside = seen.pixel_class == IN_WORKSPACE
+    sides = np.zeros(count + 1)
+    for one, other in (
+        ((slice(None, -1),), (slice(1, None),)),
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+    ):
+        apart = inside[one] & inside[other] & (regions[one] != regions[other])
+        for part in (one, other):
+            sides += np.bincount(regions[part][apart], minlength=count + 1)
+    total = ndimage.sum_labels(gain, regions, np.arange(count + 1))
+    area = ndimage.sum_labels(seen.depth**2, regions, np.arange(count + 1)) / (seen.camera.fx * seen.camera.fy)
+    camera = -T[:3, :3].T @ T[:3, 3]
+    found = []
+    for k in np.argsort(-np.bincount(regions.ravel(), minlength=count + 1)[1:], kind="stable") + 1:
+        log_gain = float(total[k] - OUTLINE_NATS * sides[k])
+        if area[k] < LEAST_THING or log_gain <= 0:
+            continue
+        own = regions == k
+        found.append(UnknownThing(np.flatnonzero(own), log_gain, *_box(points[own], camera[:2])))
+    return tuple(found)
+
+
+def _regions(
+    mask: Bool[np.ndarray, "h w"],
+    depth: Float[np.ndarray, "h w"],
+    returned: Bool[np.ndarray, "h w"],
+    points: Float[np.ndarray, "h w 3"],
+) -> tuple[Int[np.ndarray, "h w"], int]:
+    """Labels of returns that hang together, from 1 on, and how many: cut where depth jumps, joined across pixels
+    without a return, and joined where they come within `THINGS_APART` of each other."""
+    if not mask.any():
+        return np.zeros(mask.shape, int), 0
+    grown = ndimage.binary_dilation(mask, _EIGHT, iterations=_BRIDGED) & (mask | ~returned)
+    nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    pieces, count = connected_pieces(grown, depth[tuple(nearest)])
+    pieces = np.where(mask, pieces, 0)
+    where = np.flatnonzero(pieces)
+    close = cKDTree(points.reshape(-1, 3)[where]).query_pairs(THINGS_APART, output_type="ndarray")
+    own = pieces.ravel()[where]
+    apart = close[own[close[:, 0]] != own[close[:, 1]]]
+    graph = coo_array((np.ones(len(apart)), (own[apart[:, 0]], own[apart[:, 1]])), shape=(count + 1, count + 1))
+    _, group = connected_components(graph, directed=False)
+    _, label = np.unique(np.where(mask, group[pieces], -1), return_inverse=True)
+    label = label.reshape(mask.shape)
+    label = label if not mask.all() else label + 1
+    return np.where(mask, label, 0), int(label.max())
+
+
+def _box(points: Float[np.ndarray, "P 3"], camera: Float[np.ndarray, "2"]):
+    """The upright box about points over the table: the smallest rectangle around them, and where it may go on."""
+    flat = points[:, :2]
+    try:
+        corners = flat[ConvexHull(flat).vertices]
+    except (QhullError, ValueError):
+        corners = flat
+    edges = np.diff(np.vstack([corners, corners[:1]]), axis=0)
+    angles = np.unique(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2))
+    axes = np.stack([np.cos(angles), np.sin(angles)], 1), np.stack([-np.sin(angles), np.cos(angles)], 1)
+    along = [corners @ axis.T for axis in axes]
+    sides = np.stack([np.ptp(a, axis=0) for a in along], 1)
+    best = int(np.argmin(sides.prod(1)))
+    x, y = axes[0][best], axes[1][best]
+    low = np.array([along[0][:, best].min(), along[1][:, best].min()])
+    side = np.maximum(sides[best], _LEAST_SIDE)
+    centre = (low[0] + side[0] / 2) * x + (low[1] + side[1] / 2) * y
+    height = max(float(np.percentile(points[:, 2], 98)), _LEAST_SIDE)
+    view = centre - camera
+    toward = np.array([view @ x, view @ y])
+    axis = int(np.argmax(np.abs(toward)))
+    more = max(side[1 - axis], height) - side[axis]
+    behind = np.array([axis, np.sign(toward[axis]) or 1.0, max(more, 0.0)])
+    return np.append(side, height), centre, float(angles[best]), behind
+
+
+def drawn_box(thing: UnknownThing, share: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "2"], float]:
+    """Size, centre and yaw where the thing goes on for a share, 0 to 1, of how far it may."""
+    axis, end, most = int(thing.behind[0]), thing.behind[1], thing.behind[2]
+    size = thing.size.copy()
+    size[axis] += share * most
+    c, s = np.cos(thing.yaw), np.sin(thing.yaw)
+    along = np.array([[c, s], [-s, c]])[axis]
+    return size, thing.centre + 0.5 * end * share * most * along, thing.yaw
+
+
+def things_image(things: Sequence[UnknownThing], shape: tuple[int, int]) -> Int[np.ndarray, "h w"]:
+    """Which thing each pixel that is scored shows: k + 1, or 0."""
+    image = np.zeros(shape[0] * shape[1], np.int32)
+    for k, thing in enumerate(things):
+        image[thing.pixels] = k + 1
+    return image.reshape(shape)

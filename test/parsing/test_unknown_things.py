@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Things of no type in the library: told as such, beside known objects, with a box; nothing where nothing stands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import UNKNOWN, Library
+from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.validation.simulate.ray_casting import RayCaster
+
+CAMERA = Intrinsics(200.0, 200.0, 79.5, 59.5, 160, 120)
+SETTINGS = ParserSettings(particles=48, max_objects=4, table_width=0.8, table_depth=0.8)
+
+
+@pytest.fixture(scope="module")
+def library():
+    shapes = {"brick": (0.12, 0.08, 0.05), "tower": (0.06, 0.06, 0.16)}
+    return Library(tuple(model_from_mesh(trimesh.creation.box(e), n, 0.004) for n, e in shapes.items()))
+
+
+@pytest.fixture(scope="module")
+def parser(library):
+    return SceneParser(library, SETTINGS)
+
+
+def at(x, y, z, yaw=0.0):
+    T = trimesh.transformations.rotation_matrix(yaw, [0, 0, 1])
+    T[:3, 3] = x, y, z
+    return T
+
+
+BRICK = trimesh.creation.box((0.12, 0.08, 0.05)), at(-0.12, 0.02, 0.025, 0.4)
+BALL = trimesh.creation.icosphere(3, 0.045), at(0.1, 0.03, 0.045)
+
+
+def frame(*solids, seed=0):
+    """What the camera sees of solids on a table, with noise of 1 mm."""
+    s = np.sqrt(0.5)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[1, 0, 0], [0, -s, s], [0, -s, -s]])
+    T[:3, 3] = [0, -0.6 * s, 0.6 * s]
+    table = trimesh.creation.box((3, 3, 0.02)), at(0, 0, -0.01)
+    rendered = RayCaster([*solids, table]).render(T, CAMERA)
+    depth = rendered.depth + 0.001 * np.random.default_rng(seed).normal(size=rendered.depth.shape)
+    return DepthFrame(depth.astype(np.float32), CAMERA, 1_700_000_000_000_000_000 + seed, "camera", T)
+
+
+@pytest.fixture(scope="module")
+def both(parser):
+    return parser.parse(frame(BRICK, BALL))
+
+
+def test_a_known_and_an_unknown_thing(both, library):
+    assert both.types == (*library.names, UNKNOWN)
+    assert sorted(o.type for o in both.objects) == ["brick", UNKNOWN]
+    assert all(o.probability > 0.99 and o.type_probabilities[o.type] > 0.99 for o in both.objects)
+    assert both.num_objects[2] > 0.8 and both.num_unknown[1] > 0.99
+    assert both.unexplained == () and both.warnings == ()
+
+
+def test_an_unknown_thing_has_an_upright_box_on_the_table(both):
+    (ball,) = (o for o in both.objects if o.is_unknown)
+    T_table_camera = np.linalg.inv(both.T_camera_table)
+    place = T_table_camera[:3, :3] @ ball.position + T_table_camera[:3, 3]
+    assert place == pytest.approx([0.1, 0.03, 0.0], abs=0.025)  # what is behind is not seen
+    assert ball.size == pytest.approx([0.09, 0.09, 0.09], abs=0.03)
+    assert ball.contact_face == -1 and ball.face_probabilities == ()
+    assert (ball.size_sigma >= 0).all() and ball.size_sigma.max() < 0.03
+
+
+def test_samples_hold_it_as_the_last_type(both, library):
+    samples = both.samples
+    unknown = samples.type == len(library.names)
+    assert (samples.face[unknown] == -1).all() and (samples.size[unknown] > 0).all()
+    assert (samples.size[~unknown] == 0).all()
+    assert (samples.num_objects == (samples.type >= 0).sum(1)).all()
+
+
+def test_it_is_in_the_pictures(both):
+    (label,) = (k for k, o in enumerate(both.objects, 1) if o.is_unknown)
+    seen = both.segmentation == label
+    assert 250 < seen.sum() < 2000
+    assert (both.unknown_object == label - 1).all() and len(both.unknown_points) > 100
+    assert np.isfinite(both.reconstruction[seen]).all()
+    assert both.objects[label - 1].explained > 0.99
+
+
+def test_nothing_stands_on_an_empty_table(parser):
+    for seed in range(3):
+        posterior = parser.parse(frame(seed=seed))
+        assert posterior.objects == () and posterior.num_unknown[0] > 0.99
+
+
+def test_without_unknown_things_the_place_is_told(library):
+    posterior = SceneParser(library, replace(SETTINGS, unknown=False)).parse(frame(BALL))
+    assert UNKNOWN not in posterior.types and posterior.num_unknown[0] > 0.999
+    assert posterior.unexplained or posterior.objects
+
+
+def test_a_fixed_number_counts_every_thing(library):
+    posterior = SceneParser(library, replace(SETTINGS, fixed_objects=2)).parse(frame(BRICK, BALL))
+    assert posterior.num_objects[2] > 0.999
+    assert sorted(o.type for o in posterior.objects) == ["brick", UNKNOWN]
+
+
+def test_no_model_may_have_its_name():
+    for name in ("unknown", "Unknown", "UNKNOWN"):
+        with pytest.raises(ValueError, match="name may not be"):
+            model_from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), name, 0.01)
