@@ -59,7 +59,7 @@ def shared_kernel() -> Callable[..., tuple[Array, Array]]:
             f"likelihood: depth is computed on CPUs alone, and JAX computes on {jax.default_backend()}: expected "
             "JAX_PLATFORMS=cpu or likelihood: independent"
         )
-    from bayes3d_ros.likelihood.cpu.shared_gain import shared_gain
+    from bayes3d_ros.likelihood.cpu.gain import shared_gain
 
     return shared_gain
 

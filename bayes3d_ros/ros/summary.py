@@ -5,6 +5,7 @@
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from bayes3d_ros.objects.model import UNKNOWN
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, UnexplainedPlace
 from bayes3d_ros.ros.to_messages import header
 
@@ -24,7 +25,6 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     scene = DiagnosticStatus(level=level, name="scene", hardware_id=posterior.frame_id, message=names)
     scene.values = key_values(
         p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
-        p_n_unknown=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_unknown.items()),
         log_evidence=f"{posterior.log_evidence:.2f}",
         p_outlier=f"{posterior.p_outlier:.4f}",
         sigma_mm=f"{posterior.sigma * 1e3:.3f}",
@@ -32,6 +32,9 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
         ms=f"{posterior.seconds * 1e3:.0f}",
         usable_share=f"{posterior.usable_share:.2f}",
     )
+    if UNKNOWN in posterior.types:
+        unknown = " ".join(f"{n}: {p:.3f}" for n, p in posterior.num_unknown.items())
+        scene.values.insert(1, KeyValue(key="p n unknown", value=unknown))
     scene.values += [KeyValue(key=UNEXPLAINED, value=place_words(place)) for place in posterior.unexplained]
     scene.values += [KeyValue(key="note", value=note) for note in posterior.notes]
     objects = [_object_status(k, o, posterior.frame_id) for k, o in enumerate(posterior.objects, start=1)]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The loops of `handlers.py` as functions of JAX, for CPUs."""
+"""The loops of `handlers.py` and `shared_gain.py` as functions of JAX, for CPUs."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.cpu.handlers import DEPTH_TARGET, GAIN_TARGET
+from bayes3d_ros.likelihood.cpu.shared_gain import SHARED_GAIN_TARGET, WARP
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.scored_image import ScoredImage
+from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 _NEGLIGIBLE_NATS = 14.0  # nats below the outliers' density: one in a million
@@ -47,6 +49,47 @@ def compiled_gain(
         _whole([window, hypotheses.everywhere, *scene_shape, image.own_rows]),
     )
     return _call(GAIN_TARGET, shape, inputs)
+
+
+@jax.jit
+def shared_gain(
+    hypotheses: RenderedHypotheses,
+    scenes: SceneDepths,
+    image: ScoredImage,
+    library: LibraryArrays,
+    errors: SharedErrorImage,
+) -> tuple[Float[Array, "N S TA"], Float[Array, "N 3"]]:
+    """log p(image | scene and object) - log p(image | scene) of each hypothesis at each node, and the mode of the new
+    object's shared error: metres of depth at the image's first pixel, and what a column and a row add."""
+    nodes, count = errors.nodes, len(hypotheses.type)
+    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin)
+    inputs = (
+        *_things(hypotheses, library),
+        _real(image.depth),
+        _whole(image.pixel_class),
+        _real(image.ray_x),
+        _real(image.ray_y),
+        _real(numbers),
+        _real(scenes.depth),
+        _whole(scenes.ancestor),
+        _real(image.bare_depth),
+        _real(errors.spread),
+        _real(errors.table_margin),
+        _real(errors.unknown),
+        _real(nodes.sigma),
+        _real(nodes.p_outlier),
+        _real(nodes.table),
+        _real(nodes.scale),
+        _real(jnp.stack([jnp.float32(a) for a in errors.amplitudes])),
+        _whole([errors.block, *scenes.depth.shape[1:], image.own_rows]),
+    )
+    levels = nodes.log_weight.shape[1]
+    results = (
+        jax.ShapeDtypeStruct((count, len(nodes.sigma), levels), jnp.float32),
+        jax.ShapeDtypeStruct((count, WARP), jnp.float32),
+    )
+    gain, warp = jax.ffi.ffi_call(SHARED_GAIN_TARGET, results, vmap_method="sequential")(*inputs)
+    return gain, warp
 
 
 @partial(jax.jit, static_argnames="border")

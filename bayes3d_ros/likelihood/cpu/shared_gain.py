@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gain of hypotheses under `likelihood/shared_errors.py`: rendered and scored one after the other, and as a
-function of JAX."""
+"""The gain of hypotheses under `likelihood/shared_errors.py`: rendered and scored one after the other by loops that
+numba compiles, as XLA calls them on CPUs."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from bayes3d_ros.likelihood.cpu.buffers import Picture, f32, new_space
 from bayes3d_ros.likelihood.cpu.cells import (
@@ -23,7 +20,6 @@ from bayes3d_ros.likelihood.cpu.cells import (
     table_cells,
 )
 from bayes3d_ros.likelihood.cpu.compiling import handler, strict
-from bayes3d_ros.likelihood.cpu.gain import _real, _things, _whole
 from bayes3d_ros.likelihood.cpu.handlers import _objects, _render_objects
 from bayes3d_ros.likelihood.cpu.handlers import _things as _things_of
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
@@ -46,12 +42,9 @@ from bayes3d_ros.likelihood.cpu.patches import (
 )
 from bayes3d_ros.likelihood.cpu.windows import begin_patch, log, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
-from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
-from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE, SharedErrorImage
-from bayes3d_ros.objects.library_arrays import LibraryArrays
+from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE
 
-TARGET = "bayes3d_shared_gain_of_hypotheses"
+SHARED_GAIN_TARGET = "bayes3d_shared_gain_of_hypotheses"
 REACH = 2  # pixels from one that a hypothesis changes, to which its outlines matter
 WARP = 3  # numbers of the shared error of an object: metres at the image's first pixel, a column, a row
 
@@ -318,7 +311,7 @@ def _gain_of(
 
 @handler
 def _shared_gain(frame):
-    """See `shared_gain`."""
+    """See `gain.shared_gain`."""
     if answered_version(frame):
         return 0
     things, planes, numbers, whole = _things_of(frame), floats(frame, 9), floats(frame, 14), integers(frame, 26)
@@ -355,45 +348,4 @@ def _shared_gain(frame):
     return 0
 
 
-@jax.jit
-def shared_gain(
-    hypotheses: RenderedHypotheses,
-    scenes: SceneDepths,
-    image: ScoredImage,
-    library: LibraryArrays,
-    errors: SharedErrorImage,
-) -> tuple[Float[Array, "N S TA"], Float[Array, "N 3"]]:
-    """log p(image | scene and object) - log p(image | scene) of each hypothesis at each node, and the mode of the new
-    object's shared error: metres of depth at the image's first pixel, and what a column and a row add."""
-    nodes, count = errors.nodes, len(hypotheses.type)
-    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin)
-    inputs = (
-        *_things(hypotheses, library),
-        _real(image.depth),
-        _whole(image.pixel_class),
-        _real(image.ray_x),
-        _real(image.ray_y),
-        _real(numbers),
-        _real(scenes.depth),
-        _whole(scenes.ancestor),
-        _real(image.bare_depth),
-        _real(errors.spread),
-        _real(errors.table_margin),
-        _real(errors.unknown),
-        _real(nodes.sigma),
-        _real(nodes.p_outlier),
-        _real(nodes.table),
-        _real(nodes.scale),
-        _real(jnp.stack([jnp.float32(a) for a in errors.amplitudes])),
-        _whole([errors.block, *scenes.depth.shape[1:], image.own_rows]),
-    )
-    levels = nodes.log_weight.shape[1]
-    results = (
-        jax.ShapeDtypeStruct((count, len(nodes.sigma), levels), jnp.float32),
-        jax.ShapeDtypeStruct((count, WARP), jnp.float32),
-    )
-    gain, warp = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")(*inputs)
-    return gain, warp
-
-
-register(TARGET, _shared_gain)
+register(SHARED_GAIN_TARGET, _shared_gain)
