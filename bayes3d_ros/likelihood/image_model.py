@@ -18,7 +18,12 @@ from bayes3d_ros.likelihood.backends import shared_kernel
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.hypotheses import SceneDepths
 from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
-from bayes3d_ros.likelihood.scene_score import hypotheses_of, log_likelihood_gain, log_likelihood_scene
+from bayes3d_ros.likelihood.scene_score import (
+    hypotheses_of,
+    log_likelihood_gain,
+    log_likelihood_scene,
+    render_objects,
+)
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.likelihood.slow_shared_errors import NOTHING, TABLE, log_density
@@ -36,6 +41,16 @@ class SharedErrors(NamedTuple):
 
 
 ImageModel = NoiseGrid | SharedErrors
+
+
+def image_model(
+    image: ScoredImage, on_device: ScoredImage, errors: SharedErrorImage | None, grid: NoiseGrid, window: int
+) -> ImageModel:
+    """The model of an image: of errors that pixels share where there are any. image: of numpy arrays; on_device: the
+    same image; grid: of all images."""
+    if errors is None:
+        return noise_marginal.for_image(grid, on_device, window)
+    return jax.device_put(shared_errors(image, errors))
 
 
 def shared_errors(image: ScoredImage, errors: SharedErrorImage) -> SharedErrors:
@@ -61,6 +76,21 @@ def gain(
         return alone, jnp.zeros((len(ancestor), 3))
     hypotheses = hypotheses_of(placement, library, table)
     return shared_kernel()(hypotheses, SceneDepths(scenes, ancestor), image, library, model.image)
+
+
+def with_object(
+    placement: Placement,
+    warp: Float[Array, "N 3"],
+    scenes: Float[Array, "N Hp Wp"],
+    context: tuple[ScoredImage, LibraryArrays, Table],
+    window: int,
+) -> Float[Array, "N Hp Wp"]:
+    """Scene n with object n in it, as the camera shows it: with the error that the object's returns share."""
+    rendered = render_objects(placement, scenes, *context, window)
+    half = window // 2
+    column, row = (jnp.arange(n) - half for n in (scenes.shape[2], scenes.shape[1]))
+    plane = warp[:, 0, None, None] + warp[:, 1, None, None] * column + warp[:, 2, None, None] * row[:, None]
+    return jnp.where(rendered < scenes, rendered + plane, scenes)
 
 
 def log_marginal(model: ImageModel, loglik_grid: Float[Array, "N S P"]) -> Float[Array, "N"]:

@@ -51,6 +51,10 @@ LEAST_BLOCK = 2  # pixels
 # Of a Beta distribution with the mean of `bad_share`: quantiles and weights stand for it (three, as of an object).
 BAD_SPREAD = (0.35, 1.0, 2.5)
 BAD_WEIGHT = (0.3, 0.5, 0.2)
+# How a cell's modes, and an object's shared error, are followed
+MODE_STEPS, REWEIGHTED_STEPS = 5, 3
+FEWEST_INLIERS = 0.5  # returns, of a mode
+SAME_MODE_SDS = 0.5  # standard deviations within which two modes are one
 # Scales of all amplitudes of objects: log normal, at the nodes of Gauss and Hermite.
 AMPLITUDE_LOG_SD = 0.6
 _SIGMA_NODES = (-0.8, 0.8)

@@ -16,9 +16,13 @@ from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
     BAD_SPREAD,
     BAD_WEIGHT,
+    FEWEST_INLIERS,
     LOST_DEPTH,
     LOST_SHARE,
+    MODE_STEPS,
     OUTLINE_NATS,
+    REWEIGHTED_STEPS,
+    SAME_MODE_SDS,
     SEAM_DEPTH,
     SEAM_NATS,
     STEEPEST,
@@ -26,9 +30,6 @@ from bayes3d_ros.likelihood.shared_errors import (
 )
 
 NOTHING, TABLE, OBJECT = 0, 1, 2  # labels of pixels: object k is OBJECT + k
-_STEPS, _REWEIGHTED = 5, 3
-_FEWEST_INLIERS = 0.5
-_SAME_MODE = 0.5  # standard deviations
 
 
 class CellModes(NamedTuple):
@@ -72,8 +73,8 @@ def modes(cells: SurfaceCells, sigma: float, p: float) -> CellModes:
     starts = (np.zeros(len(cells.residual)), np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1))
     found = [_follow(cells, start, sigma, p) for start in starts]
     height, place, curvature, inliers = (np.stack(a) for a in zip(*found, strict=True))
-    height = np.where(inliers > _FEWEST_INLIERS, height, -np.inf)
-    same = np.abs(place[0] - place[1]) * np.sqrt(curvature.min(0)) < _SAME_MODE
+    height = np.where(inliers > FEWEST_INLIERS, height, -np.inf)
+    same = np.abs(place[0] - place[1]) * np.sqrt(curvature.min(0)) < SAME_MODE_SDS
     height[1] = np.where(same & np.isfinite(height[0]), -np.inf, height[1])
     outliers = np.where(cells.real, np.log(np.where(cells.real, p * cells.outlier + cells.lost, 1)), 0).sum(1)
     return CellModes(height, place, curvature, outliers)
@@ -86,7 +87,7 @@ def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: flo
         total = p * cells.outlier + cells.lost + inlier
         return np.where(cells.real, inlier / total, 0), np.where(cells.real, np.log(np.where(cells.real, total, 1)), 0)
 
-    for _ in range(_STEPS):
+    for _ in range(MODE_STEPS):
         share, _ = parts(b)
         weight = share * cells.precision
         b = np.where(share.sum(1) > 1e-6, (weight * cells.residual).sum(1) / np.maximum(weight.sum(1), 1e-12), b)
@@ -206,24 +207,23 @@ def log_edges(
     noise = sigma * errors.spread[v, u].astype(np.float64)
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
     of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
-    apart_: list[np.ndarray] = []
-    across_, inlier_, points_ = [], [], []
+    window = []
     for dv, du in _around():
         y = _shifted(depth, dv, du, np.inf)[v, u]
         there = _shifted(label, dv, du, NOTHING)[v, u]
         surface = np.isfinite(y)
         y0 = np.where(surface, y, 0)
         ex, ey = du / float(image.focal[0]), dv / float(image.focal[1])
-        apart_.append(np.where(surface, du**2 + dv**2, np.inf))
-        across_.append(np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf))
+        apart = np.where(surface, du**2 + dv**2, np.inf)
+        across = np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf)
         variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
         off = observed - y0 * (1 + (ex * a + ey * b) / norm2)
-        inlier_.append(np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance))
-        points_.append(np.where(surface, y0, np.nan))
-    across, inlier, points = np.array(across_), np.array(inlier_), np.array(points_)
+        inlier = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
+        window.append((apart, across, inlier, np.where(surface, y0, np.nan)))
+    apart, across, inlier, points = (np.array(part) for part in zip(*window, strict=True))
     any_surface = np.isfinite(points).any(0)
     nearest = np.where(any_surface, across.min(0), 0)
-    blur, apart = float(amplitudes.edge_blur), np.array(apart_)
+    blur = float(amplitudes.edge_blur)
     weight = np.exp(-0.5 * (across - nearest) / noise**2) + LATERAL
     if blur > 0:
         weight = np.exp(-0.5 * (apart - np.where(any_surface, apart.min(0), 0)) / blur**2)
@@ -281,7 +281,7 @@ def log_object(cells: SurfaceCells, node: int, scale: float, errors: SharedError
     prior = np.array([bias2 + wave2, wave2 / float(amplitudes.length) ** 2, wave2 / float(amplitudes.length) ** 2])
     prior = np.maximum(prior, 1e-12)
     a = np.zeros(3)
-    for step in range(_REWEIGHTED):
+    for step in range(REWEIGHTED_STEPS):
         sd = np.sqrt(model**2 + prior[0]) if step == 0 else model
         information, pull = _information(found, phi, a, sd, share, bad)
         a = np.linalg.solve(information + np.diag(1 / prior), pull)

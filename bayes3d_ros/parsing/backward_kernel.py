@@ -29,7 +29,7 @@ class Empty(NamedTuple):
 
 def empty_table(context: Context, model: ImageModel, window: int) -> Empty:
     scene = pad_scene(context.image.bare_depth, window)[None]
-    loglik_grid = jnp.asarray(empty_likelihood(model, scene, context.image, window))
+    loglik_grid = empty_likelihood(model, scene, context.image, window)
     return Empty(scene, loglik_grid, log_marginal(model, loglik_grid))
 
 

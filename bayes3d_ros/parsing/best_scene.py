@@ -34,15 +34,15 @@ class BestScene:
         poses = [pose_matrix(samples.position[best, slot], samples.orientation[best, slot]) for _, slot in known]
         return kinds, poses, [k for k, _ in known]
 
-    def labels_of_things(self) -> Int[np.ndarray, "T1"]:
-        """Of thing t its label, k + 1 of object k, at t + 1; 0 where it is not listed."""
+    def _shown(self, seen: Observation) -> Int[np.ndarray, "h w"]:
+        """Labels, k + 1 of object k, of the things that scored pixels show; 0 where none is listed."""
         kinds = self.samples.type[self.summary.reference]
         first = int((kinds >= 0).sum()) - len(self.things)
         labels = np.zeros(len(self.things) + 1, np.int32)
         for k, slot in enumerate(self.summary.slots):
             if kinds[slot] == self.unknown_type:
                 labels[slot - first + 1] = k + 1
-        return labels
+        return labels[things_image(self.things, seen.depth.shape)]
 
     def with_things(
         self,
@@ -55,9 +55,7 @@ class BestScene:
         returned from it."""
         if not self.things:
             return depth, label
-        shown = self.labels_of_things()[things_image(self.things, seen.depth.shape)]
-        intrinsics = frame.intrinsics
-        shown = resize_nearest(shown, intrinsics.width, intrinsics.height)
+        shown = resize_nearest(self._shown(seen), frame.intrinsics.width, frame.intrinsics.height)
         with np.errstate(invalid="ignore"):
             nearer = (shown > 0) & np.isfinite(frame.depth) & ~(frame.depth > depth)
         return (
@@ -67,7 +65,7 @@ class BestScene:
 
     def unknown_returns(self, seen: Observation) -> dict[str, np.ndarray]:
         """Scored returns of the listed things: x y z in the camera, metres, and which object."""
-        shown = self.labels_of_things()[things_image(self.things, seen.depth.shape)]
+        shown = self._shown(seen)
         where = shown > 0
         return {
             "unknown_points": unproject(seen.depth, seen.camera)[where].astype(np.float32),

@@ -50,8 +50,8 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
             f"({np.isfinite(frame.depth).mean():.0%} of its pixels hold a value)"
         )
     points = unproject(np.where(returned, depth, np.nan), camera)
-    T_given, notes = _find_table(frame, points[returned], settings.table)
-    table = seen_table(points[returned], T_given, bool(notes), settings)
+    T_given, found = _find_table(frame, points[returned], settings.table)
+    table = seen_table(points[returned], T_given, found, settings)
     T_camera_table = table.T_camera_table
     table_size = (settings.table_width, settings.table_depth)
     pixel_class = workspace(points, T_camera_table, table_size, settings.workspace_height)
@@ -59,6 +59,7 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
     image, errors = _as_scored(camera, depth, pixel_class, T_camera_table, settings)
     usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
     placed = table_of(T_camera_table, settings)
+    notes = ["table found in the depth image"] if found else []
     return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes)
 
 
@@ -82,13 +83,13 @@ def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[Score
 
 def _find_table(
     frame: DepthFrame, points: Float[np.ndarray, "N 3"], source: str
-) -> tuple[Float[np.ndarray, "4 4"], list[str]]:
-    """T_camera_table, and what to say of where it comes from; source: the setting `table`."""
+) -> tuple[Float[np.ndarray, "4 4"], bool]:
+    """T_camera_table, and whether it was found in the depth image; source: the setting `table`."""
     if source != "depth" and frame.T_table_camera is not None:
-        return np.linalg.inv(frame.T_table_camera), []
+        return np.linalg.inv(frame.T_table_camera), False
     if source == "pose":
         raise ParseError("no camera pose for this frame, and table:=pose expects one")
-    return table_frame(find_plane(points), points), ["table found in the depth image"]
+    return table_frame(find_plane(points), points), True
 
 
 def _as_scored(

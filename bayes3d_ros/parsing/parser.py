@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.likelihood import noise_marginal
-from bayes3d_ros.likelihood.image_model import ImageModel, sample_noise, shared_errors
+from bayes3d_ros.likelihood.image_model import ImageModel, image_model, sample_noise
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.objects.library_arrays import library_arrays
@@ -29,7 +29,7 @@ from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
 from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
-from bayes3d_ros.posterior.summarise import Summary, summarise
+from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import ParserSettings
 
@@ -89,6 +89,7 @@ class SceneParser:
         noise = float(samples.sigma[summary.reference]), settings.sigma_max
         explanation = explain(seen, reconstruction, segmentation, len(summary.objects), noise)
         shares = zip(summary.objects, explanation.explained, strict=True)
+        full = settings.fixed_objects < 0 and len(summary.objects) >= settings.max_objects
         return ScenePosterior(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
@@ -106,8 +107,8 @@ class SceneParser:
             T_camera_table=seen.T_camera_table,
             ess=tuple(ess),
             seconds=time.perf_counter() - start,
-            notes=(*warning_notes(seen.usable_share, explanation.unexplained, self._full(summary)), *seen.notes),
-            room=self.settings.max_objects,
+            notes=(*warning_notes(seen.usable_share, explanation.unexplained, full), *seen.notes),
+            full=full,
             usable_share=seen.usable_share,
             unexplained=explanation.unexplained,
             **scene.unknown_returns(seen),
@@ -115,10 +116,8 @@ class SceneParser:
 
     def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> tuple[Context, ImageModel]:
         on_device = jax.device_put(image)
-        context = Context(on_device, self._arrays, table)
-        if errors is None:
-            return context, noise_marginal.for_image(self._grid, on_device, self.settings.window)
-        return context, jax.device_put(shared_errors(image, errors))
+        model = image_model(image, on_device, errors, self._grid, self.settings.window)
+        return Context(on_device, self._arrays, table), model
 
     def _sample(
         self, key: PRNGKeyArray, context: Context, model: ImageModel, seen: Observation | None = None
@@ -227,24 +226,20 @@ class SceneParser:
         """The mixture over the number of known objects, log p(image) - log p(image | empty), and of each sample what is
         of no type in the library."""
         settings = self.settings
-        known = np.log1p(-settings.unknown_probability) if self.settings.knows_unknown else 0.0
+        known = np.log1p(-settings.unknown_probability) if settings.knows_unknown else 0.0
         log_prior = np.arange(len(stages)) * (np.log(settings.count_ratio) + known)
         if settings.fixed_objects < 0:
             log_prior -= np.logaddexp.reduce(np.arange(settings.max_objects + 1) * np.log(settings.count_ratio))
         else:
             log_prior -= settings.fixed_objects * np.log(settings.count_ratio)
-            if not self.settings.knows_unknown:
+            if not settings.knows_unknown:
                 stages = [stage._replace(log_evidence=-np.inf) for stage in stages[:-1]] + stages[-1:]
             reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
-            if not reached or (not self.settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
+            if not reached or (not settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
         image = seen.image
         outline = settings.outline_sigma / float(image.focal[0]) if settings.shares_errors else 0.0
         return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline)
-
-    def _full(self, summary: Summary) -> bool:
-        """Whether a scene could hold no more objects than the best one does."""
-        return self.settings.fixed_objects < 0 and len(summary.objects) >= self.settings.max_objects
 
     def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):
         """Depth and labels of the best scene at the input's size."""

@@ -17,8 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal
-from bayes3d_ros.likelihood.scene_score import render_objects
+from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal, with_object
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
 from bayes3d_ros.parsing.context import Context
@@ -154,21 +153,6 @@ def _scenes_without(
 
     bare = jnp.broadcast_to(frame.empty.scene, state.scenes.shape)
     return jax.lax.fori_loop(0, count, with_other, bare)
-
-
-def with_object(
-    placement: Placement,
-    warp: Float[Array, "N 3"],
-    scenes: Float[Array, "N Hp Wp"],
-    context: Context,
-    window: int,
-) -> Float[Array, "N Hp Wp"]:
-    """Scene n with object n in it, as the camera shows it: with the error that the object's returns share."""
-    rendered = render_objects(placement, scenes, *context, window)
-    half = window // 2
-    column, row = (jnp.arange(n) - half for n in (scenes.shape[2], scenes.shape[1]))
-    plane = warp[:, 0, None, None] + warp[:, 1, None, None] * column + warp[:, 2, None, None] * row[:, None]
-    return jnp.where(rendered < scenes, rendered + plane, scenes)
 
 
 def _heat_and_cool(

@@ -262,8 +262,7 @@ def _searched(
     modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
     if not isinstance(model, NoiseGrid):
         # Against something unknown a wrong object may lose what it gains over the table: the model itself chooses.
-        _, marginal = _targets(take(modes.placement, jnp.argmax(value)[None]), scene, context, model, window)
-        value = marginal(modes.placement)
+        value = _marginal_gains(model, scene.loglik_grid, scene, context, window)(modes.placement)
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
     modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
@@ -291,12 +290,21 @@ def _targets(
     def exact(placement: Placement) -> Float[Array, "N"]:
         return _gains(placement, scene.depth, context, noise, window)
 
+    return exact, _marginal_gains(part, scene.loglik_grid[rows], scene, context, window)
+
+
+def _marginal_gains(
+    model: ImageModel, loglik_grid: Float[Array, "S P"], scene: LeadScene, context: Context, window: int
+) -> Gains:
+    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out;
+    loglik_grid: the scene's at these nodes."""
+
     def marginal(placement: Placement) -> Float[Array, "N"]:
         ancestor = jnp.zeros(placement.type.shape, jnp.int32)
-        gained, _ = gain(part, placement, ancestor, scene.depth[None], context, window)
-        return log_marginal(part, scene.loglik_grid[rows] + gained)
+        gained, _ = gain(model, placement, ancestor, scene.depth[None], context, window)
+        return log_marginal(model, loglik_grid + gained)
 
-    return exact, marginal
+    return marginal
 
 
 def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:

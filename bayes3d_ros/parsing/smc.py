@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal
+from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal, with_object
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
@@ -32,7 +32,7 @@ from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
-from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate, with_object
+from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample, systematic

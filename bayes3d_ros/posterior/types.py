@@ -2,14 +2,14 @@
 
 """The posterior over scenes: weighted samples, and the summaries that people and robots read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayes3d_ros.objects.model import UNKNOWN
+from bayes3d_ros.objects.model import UNKNOWN, ObjectModel
 
 # Of the pixels on the table. Three objects on a bundled table, pixels missing at random: all are found with 0.4 usable,
 # one is taken for another type with 0.36, one is missed with 0.33, and with 0.29 the table passes for empty, p 0.98.
@@ -66,6 +66,15 @@ class ObjectEstimate:
     size: Float[np.ndarray, "3"] | None = None
     size_sigma: Float[np.ndarray, "3"] | None = None
 
+    def box(self, models: Mapping[str, ObjectModel]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
+        """T_object_box, at the box's centre, and the box's sides in metres: of the model, or of an unknown thing."""
+        if self.size is None:
+            model = models[self.type]
+            return model.T_object_box, model.box_size
+        T_object_box = np.eye(4)
+        T_object_box[2, 3] = self.size[2] / 2  # its origin is at the centre of the base
+        return T_object_box, self.size
+
     @property
     def is_unknown(self) -> bool:
         """Whether it is most probably of no type in the library."""
@@ -105,7 +114,7 @@ class ScenePosterior:
     # where it is not known. Where it is too low, `notes` says so.
     usable_share: float = float("nan")
     unexplained: tuple[UnexplainedPlace, ...] = ()  # most returns first
-    room: int | None = None  # most objects that a scene may hold; None: it does not matter
+    full: bool = False  # whether a scene could hold no more objects than the best one does
     num_unknown: dict[int, float] = field(default_factory=dict)  # p(number of objects of no type in the library)
     # What returned from unknown things of the best scene: x y z in the camera, metres, and which of `objects`.
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
@@ -119,8 +128,7 @@ class ScenePosterior:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Those of the notes without which the posterior would be misread, worst first."""
-        full = self.room is not None and len(self.objects) >= self.room
-        return warning_notes(self.usable_share, self.unexplained, full)
+        return warning_notes(self.usable_share, self.unexplained, self.full)
 
 
 def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace], full: bool = False) -> tuple[str, ...]:

@@ -4,12 +4,9 @@
 
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from bayes3d_ros.objects.model import Library, ObjectModel
+from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.summarise import modes_by_type
-from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior
+from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.ros.to_messages import header, matrix_to_pose, pose_message
 
@@ -43,21 +40,9 @@ def detection_array(posterior: ScenePosterior, library: Library) -> Any:
             result.pose.pose = pose_message(mode.position, mode.orientation)
             result.pose.covariance = mode.covariance.ravel().astype(float)
             detection.results.append(result)
-        T_object_box, size = _box(estimate, models)
+        T_object_box, size = estimate.box(models)
         T_camera_box = matrix_from_values([*estimate.position, *estimate.orientation]) @ T_object_box
         detection.bbox.center = matrix_to_pose(T_camera_box)
         detection.bbox.size.x, detection.bbox.size.y, detection.bbox.size.z = (float(s) for s in size)
         array.detections.append(detection)
     return array
-
-
-def _box(
-    estimate: ObjectEstimate, models: dict[str, ObjectModel]
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
-    """T_object_box and the sides of its box, metres."""
-    if estimate.size is None:
-        model = models[estimate.type]
-        return model.T_object_box, model.box_size
-    T_object_box = np.eye(4)
-    T_object_box[2, 3] = estimate.size[2] / 2  # its origin is at the centre of the base
-    return T_object_box, estimate.size

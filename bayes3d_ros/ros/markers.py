@@ -37,7 +37,7 @@ class SceneMarkers:
             pose = pose_message(estimate.position, estimate.orientation)
             solid = self._solid(estimate, label)
             solid.pose = pose
-            side = _longest_side(estimate, self._models)
+            side = float(np.max(estimate.box(self._models)[1]))
 
             name = Marker(type=Marker.TEXT_VIEW_FACING, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
             above = estimate.position - [0.0, 0.5 * side + _TEXT_HEIGHT, 0.0]  # y points down
@@ -75,10 +75,6 @@ class SceneMarkers:
         box = Marker(type=Marker.CUBE_LIST, color=label_colour(label, 0.35), scale=Vector3(x=x, y=y, z=z))
         box.points = [Point(x=0.0, y=0.0, z=z / 2)]
         return box
-
-
-def _longest_side(estimate: ObjectEstimate, models: dict[str, ObjectModel]) -> float:
-    return float(np.max(models[estimate.type].box_size if estimate.size is None else estimate.size))
 
 
 def principal_axes(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:

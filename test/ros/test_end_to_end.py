@@ -34,7 +34,7 @@ def test_a_bundled_bag_is_parsed_by_the_node(ros, tmp_path: Path) -> None:
     assert {h.frame_id for h in headers} == {"camera_depth_optical_frame"}
     images = {name: (m.encoding, m.width, m.height, m.step) for name, m in messages.items() if hasattr(m, "encoding")}
     assert images == {"segmentation": ("16UC1", 640, 480, 1280), "depth_reconstruction": ("32FC1", 640, 480, 2560)}
-    assert outputs.library is not None and outputs.library.data == "004_sugar_box"
+    assert outputs.library is not None and outputs.library.data == "004_sugar_box\nunknown"
 
     posterior = posterior_from_messages(outputs.by_stamp[stamp], load_library(folder))
     (estimate,) = posterior.objects

@@ -36,7 +36,7 @@ GAIN_TARGET, DEPTH_TARGET = "bayes3d_gain_of_hypotheses", "bayes3d_depth_of_hypo
 
 
 @inlined
-def _render_objects(things, n, objects, picture, patch, stride, shift, space):
+def render_all(things, n, objects, picture, patch, stride, shift, space):
     """The objects whose outlines have been found, into a patch that holds them."""
     for k in range(objects):
         render_object(things, n * objects + k, k, picture, patch, stride, shift, space)
@@ -54,7 +54,7 @@ def _gains(
     gain, space, windows, now, former
 ):  # fmt: skip
     count, border = len(planes) // 4, window // 2
-    objects, levels = _objects(things, planes), len(sigma) * len(p_outlier)
+    objects, levels = objects_each(things, planes), len(sigma) * len(p_outlier)
     with_scenes = len(scenes) > 0
     for n in range(count):
         plane = planes[4 * n : 4 * n + 4]
@@ -71,7 +71,7 @@ def _gains(
         first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
         if flat:
             _render_planes(plane, picture, space.patch, stride, shift)
-        _render_objects(things, n, objects, picture, space.patch, stride, shift, space)
+        render_all(things, n, objects, picture, space.patch, stride, shift, space)
         low, high = mark_changes(space.patch, space.before, size, space.changed)
         windows_with(space.changed, size, stride, border, space.wider, space.seen)
         low, high = low * (f32(1.0) - share) - metres, high * (f32(1.0) + share) + metres
@@ -106,7 +106,7 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
     """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
     with, or none, and what each hypothesis adds."""
     count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
-    objects = _objects(things, planes)
+    objects = objects_each(things, planes)
     for n in range(count):
         image = depth[n * pixels : (n + 1) * pixels]
         for k in range(pixels):
@@ -115,13 +115,13 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
         if everywhere and _is_plane(plane):
             _render_planes(plane, picture, image, columns, shift)
         find_outlines(things, n, objects, picture, space)
-        _render_objects(things, n, objects, picture, image, columns, shift, space)
+        render_all(things, n, objects, picture, image, columns, shift, space)
         for k in range(pixels):
             image[k] = image[k] if image[k] < NO_SURFACE_METRES else f32(NO_SURFACE)
 
 
 @strict
-def _objects(things, planes):
+def objects_each(things, planes):
     """How many objects a hypothesis has; every hypothesis has one plane."""
     return len(things.type_id) // max(len(planes) // 4, 1)
 
@@ -132,11 +132,21 @@ def _is_plane(plane):
 
 
 @strict
-def _things(frame):
-    """The first nine arguments of both targets."""
+def things_of(frame):
+    """The first nine arguments of all targets."""
     return Things(
         integers(frame, 0), integers(frame, 1), integers(frame, 2), floats(frame, 3), floats(frame, 4),
         integers(frame, 5), floats(frame, 6), integers(frame, 7), floats(frame, 8),
+    )  # fmt: skip
+
+
+@strict
+def picture_of(frame, own_rows):
+    """Arguments 10 to 14 of the targets that score, of so many rows."""
+    numbers = floats(frame, 14)
+    return Picture(
+        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13)[:own_rows],
+        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
     )  # fmt: skip
 
 
@@ -145,18 +155,15 @@ def _gain(frame):
     """See `gain.compiled_gain`."""
     if answered_version(frame):
         return 0
-    things, planes, sigma = _things(frame), floats(frame, 9), floats(frame, 17)
+    things, planes, sigma = things_of(frame), floats(frame, 9), floats(frame, 17)
     numbers, settings = floats(frame, 14), integers(frame, 19)
     window = settings[0]
-    picture = Picture(
-        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13)[: settings[4]],
-        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
-    )  # fmt: skip
+    picture = picture_of(frame, settings[4])
     _gains(
         things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
         numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
         new_space(
-            len(picture.ray_y), len(picture.ray_x), window // 2, _objects(things, planes), most_corners(things)
+            len(picture.ray_y), len(picture.ray_x), window // 2, objects_each(things, planes), most_corners(things)
         ),
         new_windows(window * window),
         np.zeros(len(sigma) * WINDOWS_SIDE_BY_SIDE, np.float32),
@@ -170,7 +177,7 @@ def _depth(frame):
     """See `gain.compiled_depth`."""
     if answered_version(frame):
         return 0
-    things, planes = _things(frame), floats(frame, 9)
+    things, planes = things_of(frame), floats(frame, 9)
     numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
         start, things.type_id, floats(frame, 10), floats(frame, 11)[: shape[4]],
@@ -178,7 +185,7 @@ def _depth(frame):
     )  # fmt: skip
     _depths(
         things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
-        new_space(len(picture.ray_y), len(picture.ray_x), 0, _objects(things, planes), most_corners(things)),
+        new_space(len(picture.ray_y), len(picture.ray_x), 0, objects_each(things, planes), most_corners(things)),
     )  # fmt: skip
     return 0
 

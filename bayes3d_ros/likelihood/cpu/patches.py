@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, VECTOR_LANES, f32, i32, u8, u64
+from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, i32, u8, u64
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
 from bayes3d_ros.likelihood.cpu.packing import lesser
-from bayes3d_ros.likelihood.cpu.windows import exp, log
+from bayes3d_ros.likelihood.cpu.windows import exp, log, windows_with
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, LATERAL
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
@@ -38,38 +38,35 @@ class Returns(NamedTuple):
     columns: int
 
 
-class Patch(NamedTuple):
-    """Of a patch with a border: labels and kinds, of the scene with the object and of that without."""
+class ScenePixels(NamedTuple):
+    """A scene in a patch with a border: its depth, and what each pixel is."""
 
+    depth: Float[np.ndarray, "I"]  # NO_SURFACE_METRES where there is no surface
     label: Int[np.ndarray, "I"]
-    former_label: Int[np.ndarray, "I"]
     kind: Int[np.ndarray, "I"]
-    former_kind: Int[np.ndarray, "I"]
+    near_outline: Int[np.ndarray, "I"]  # pixels about those with several surfaces
+
+
+class Patch(NamedTuple):
+    """The bare table in the patch, and what one scene after the other is worked out in."""
+
+    bare: Float[np.ndarray, "I"]
     several: Int[np.ndarray, "I"]
     front: Float[np.ndarray, "I"]  # the least depth of the pixel and of objects in its window
     beside: Int[np.ndarray, "I"]  # whether there are any
-    near_outline: Int[np.ndarray, "I"]  # pixels about those with several surfaces
-    former_near: Int[np.ndarray, "I"]
-    bare: Float[np.ndarray, "I"]
+    nowhere: Int[np.ndarray, "I"]  # no flag: nothing that a scene changes
 
 
 @allocating
-def new_patch(height, width, border):
-    size = (height + 2 * border) * (width + 2 * border) + VECTOR_LANES
-    flags = np.zeros(size, np.uint8)
-    copies = flags.copy(), flags.copy(), flags.copy(), flags.copy(), flags.copy(), flags.copy()
-    return Patch(
-        flags,
-        copies[0],
-        copies[1],
-        copies[2],
-        copies[3],
-        np.zeros(size, np.float32),
-        copies[4],
-        copies[5],
-        flags.copy(),
-        np.zeros(size, np.float32),
-    )
+def new_patch(size):
+    none = np.zeros(size, np.uint8)
+    return Patch(np.zeros(size, np.float32), none, np.zeros(size, np.float32), none.copy(), none.copy())
+
+
+@allocating
+def new_scene_pixels(depth):
+    none = np.zeros(len(depth), np.uint8)
+    return ScenePixels(depth, none, none.copy(), none.copy())
 
 
 @strict
@@ -83,7 +80,7 @@ def begin_bare(returns, bare, stride, size, left, top, height):
 
 
 @fast
-def find_labels(depth, bare, changed, size, label):
+def _find_labels(depth, bare, changed, size, label):
     for k in range(u64(size)):
         nothing = depth[k] >= f32(NO_SURFACE_METRES)
         table = depth[k] == bare[k]
@@ -93,7 +90,7 @@ def find_labels(depth, bare, changed, size, label):
 
 
 @fast
-def find_several(depth, label, first, last, stride, step_x, step_y, several, front, beside):
+def _find_several(depth, label, first, last, stride, step_x, step_y, several, front, beside):
     """Pixels whose windows show several surfaces; and the objects there."""
     for k in range(u64(first), u64(last)):
         several[k] = u8(label[k] == u8(NOTHING))
@@ -114,7 +111,7 @@ def find_several(depth, label, first, last, stride, step_x, step_y, several, fro
 
 
 @strict
-def find_kinds(picture, returns, space, depth, patch, stride, size, border, left, top, kind):
+def _find_kinds(picture, returns, space, depth, patch, stride, size, border, left, top, kind):
     for k in range(size):
         kind[k] = u8(NOT_SCORED)
     rows, columns = size // stride, stride
@@ -134,6 +131,19 @@ def find_kinds(picture, returns, space, depth, patch, stride, size, border, left
                     kind[k] = u8(EDGE) if several[k] else u8(CELL)
             elif sort == BEYOND and depth[k] < z + picture.front_margin:
                 kind[k] = u8(HIDDEN)
+
+
+@strict
+def sort_scene(picture, returns, space, patch, scene, changed, stride, size, border, left, top):
+    """What each pixel of a scene is; `changed`: where it shows the new object."""
+    first, last = border * stride + border, size - border * stride - border
+    step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
+    _find_labels(scene.depth, patch.bare, changed, size, scene.label)
+    _find_several(
+        scene.depth, scene.label, first, last, stride, step_x, step_y, patch.several, patch.front, patch.beside
+    )
+    _find_kinds(picture, returns, space, scene.depth, patch, stride, size, border, left, top, scene.kind)
+    windows_with(patch.several, size, stride, border, space.wider, scene.near_outline)
 
 
 @strict

@@ -5,23 +5,18 @@ numba compiles, as XLA calls them on CPUs."""
 
 import numpy as np
 
-from bayes3d_ros.likelihood.cpu.buffers import Picture, f32, new_space
-from bayes3d_ros.likelihood.cpu.cells import (
-    CELLS_SIDE_BY_SIDE,
+from bayes3d_ros.likelihood.cpu.buffers import f32, new_space
+from bayes3d_ros.likelihood.cpu.cells import CELLS_SIDE_BY_SIDE, find_modes, new_batch, normal_cells, table_cells
+from bayes3d_ros.likelihood.cpu.compiling import handler, strict
+from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
+from bayes3d_ros.likelihood.cpu.object_cells import (
     begin_object,
-    find_modes,
     find_shared_error,
     log_object,
-    new_batch,
     new_object_cells,
-    normal_cells,
     place_cells,
     reference_height,
-    table_cells,
 )
-from bayes3d_ros.likelihood.cpu.compiling import handler, strict
-from bayes3d_ros.likelihood.cpu.handlers import _objects, _render_objects
-from bayes3d_ros.likelihood.cpu.handlers import _things as _things_of
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
     CELL,
@@ -33,12 +28,11 @@ from bayes3d_ros.likelihood.cpu.patches import (
     UNKNOWN,
     Returns,
     begin_bare,
-    find_kinds,
-    find_labels,
-    find_several,
     log_edge,
     mask_nats,
     new_patch,
+    new_scene_pixels,
+    sort_scene,
 )
 from bayes3d_ros.likelihood.cpu.windows import begin_patch, log, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
@@ -50,9 +44,7 @@ WARP = 3  # numbers of the shared error of an object: metres at the image's firs
 
 
 @strict
-def _gather(
-    picture, returns, space, near, lost, depth, label, kind, sign, rectangle, stride, left, top, label_of, batch, used
-):
+def _gather(picture, returns, space, scene, lost, sign, rectangle, stride, left, top, label, batch, used):
     """The cell of one label in a block, as the next of the batch; whether there is one."""
     u0, u1, v0, v1 = rectangle
     slot, w = 0, CELLS_SIDE_BY_SIDE
@@ -60,23 +52,23 @@ def _gather(
     for v in range(v0, v1):
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
-            if kind[k] != CELL or label[k] != label_of:
+            if scene.kind[k] != CELL or scene.label[k] != label:
                 continue
             x, y, z = picture.ray_x[u], picture.ray_y[v], space.depth[k]
             spread = returns.spread[v * returns.columns + u]
             at = slot * w + used
             precision = (f32(1.0) + x * x + y * y) / (spread * spread)
-            batch.residual[at] = z - depth[k]
+            batch.residual[at] = z - scene.depth[k]
             batch.precision[at] = precision
             batch.root[at] = np.sqrt(precision * f32(1 / (2 * np.pi)))
             batch.outlier[at] = picture.outlier_scale * z * z
-            batch.lost[at] = lost if near[k] != 0 else f32(0.0)
+            batch.lost[at] = lost if scene.near_outline[k] != 0 else f32(0.0)
             column, row = column + u, row + v
             slot += 1
     if slot == 0:
         return False
     count = slot
-    # The median, by sorting a copy behind the batch's own rows: insertion, in place.
+    # The median, by sorting the cell's returns: insertion, in place.
     for a in range(1, count):
         for b in range(a, 0, -1):
             one, other = (b - 1) * w + used, b * w + used
@@ -92,7 +84,7 @@ def _gather(
     if count % 2 == 0:
         median = f32(0.5) * (median + batch.residual[(middle - 1) * w + used])
     batch.start[used] = median
-    batch.label[used], batch.sign[used] = label_of, sign
+    batch.label[used], batch.sign[used] = label, sign
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
     return True
 
@@ -108,8 +100,8 @@ def _clear(batch, returns):
 
 
 @strict
-def _add_cells(batch, used, label, sums):
-    """Adds the batch's values, of cells of one label."""
+def _sum_of_cells(batch, used, label):
+    """The sum of the batch's values, of cells of one label."""
     total = 0.0
     for c in range(used):
         if batch.label[c] == label:
@@ -131,10 +123,10 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
         find_modes(batch, returns, sigma[s], p_outlier[s])
         for t in range(tables if of_table > 0 else 0):
             table_cells(batch, table[t] * table[t])
-            fixed[s * tables + t] += _add_cells(batch, used, TABLE, fixed)
+            fixed[s * tables + t] += _sum_of_cells(batch, used, TABLE)
         for a in range(scales if of_old > 0 else 0):
             normal_cells(batch, f32((scale[a] * amplitudes[3]) ** 2), amplitudes[4])
-            old[s * scales + a] += _add_cells(batch, used, OLD, old)
+            old[s * scales + a] += _sum_of_cells(batch, used, OLD)
         kept = new_cells
         for c in range(used if of_new > 0 else 0):
             if batch.label[c] != NEW:
@@ -151,7 +143,7 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
 
 
 @strict
-def _score_pixels(picture, returns, space, depth, label, kind, sign, rectangle, stride, left, top, nodes, fixed):
+def _score_pixels(picture, returns, space, scene, sign, rectangle, stride, left, top, nodes, fixed):
     """What returns that belong to no cell say."""
     sigma, p_outlier, table, _, amplitudes = nodes
     u0, u1, v0, v1 = rectangle
@@ -160,27 +152,17 @@ def _score_pixels(picture, returns, space, depth, label, kind, sign, rectangle, 
     for v in range(v0, v1):
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
-            if kind[k] != UNKNOWN and kind[k] != EDGE and kind[k] != HIDDEN:
+            kind = scene.kind[k]
+            if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
                 continue
             for s in range(len(sigma)):
-                if kind[k] == UNKNOWN:
+                if kind == UNKNOWN:
                     value = returns.unknown[(s * returns.rows + v) * returns.columns + u]
-                elif kind[k] == EDGE:
+                elif kind == EDGE:
                     value = log_edge(
-                        picture,
-                        returns,
-                        space,
-                        depth,
-                        label,
-                        k,
-                        stride,
-                        left,
-                        top,
-                        sigma[s],
-                        p_outlier[s],
-                        amplitudes,
-                        middle,
-                    )
+                        picture, returns, space, scene.depth, scene.label, k, stride, left, top, sigma[s], p_outlier[s],
+                        amplitudes, middle,
+                    )  # fmt: skip
                 else:
                     value = log(p_outlier[s])
                 for t in range(tables):
@@ -189,8 +171,8 @@ def _score_pixels(picture, returns, space, depth, label, kind, sign, rectangle, 
 
 @strict
 def _gain_of(
-    things, n, objects, picture, returns, scenes, scene_at, scene_stride, block, nodes, space, patch, batch, own, fixed,
-    old, sums, gain, warp,
+    things, n, objects, picture, returns, scenes, scene_at, scene_stride, block, nodes, space, patch, now, former,
+    batch, own, fixed, old, sums, gain, warp,
 ):  # fmt: skip
     sigma, p_outlier, table, scale, amplitudes = nodes
     border, tables, scales = 1, len(table), len(scale)
@@ -203,31 +185,17 @@ def _gain_of(
     u1 = min((rectangle[1] + REACH + block - 1) // block * block, width)
     v1 = min((rectangle[3] + REACH + block - 1) // block * block, height)
     stride, size, left, top = begin_patch(picture, scenes, scene_at, scene_stride, (u0, u1, v0, v1), border, space)
-    first, last, shift = border * stride + border, size - border * stride - border, -top * stride - left
-    _render_objects(things, n, objects, picture, space.patch, stride, shift, space)
-    mark_changes(space.patch, space.before, size, space.changed)
+    render_all(things, n, objects, picture, now.depth, stride, -top * stride - left, space)
+    mark_changes(now.depth, former.depth, size, space.changed)
     windows_with(space.changed, size, stride, border, space.wider, space.seen)
     begin_bare(returns, patch.bare, stride, size, left, top, height)
-    step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
-    find_labels(space.patch, patch.bare, space.changed, size, patch.label)
-    find_several(
-        space.patch, patch.label, first, last, stride, step_x, step_y, patch.several, patch.front, patch.beside
-    )
-    find_kinds(picture, returns, space, space.patch, patch, stride, size, border, left, top, patch.kind)
-    windows_with(patch.several, size, stride, border, space.wider, patch.near_outline)
-    for k in range(size):
-        space.wider[k] = 0
-    find_labels(space.before, patch.bare, space.wider, size, patch.former_label)
-    find_several(
-        space.before, patch.former_label, first, last, stride, step_x, step_y, patch.several, patch.front, patch.beside
-    )
-    find_kinds(picture, returns, space, space.before, patch, stride, size, border, left, top, patch.former_kind)
-    windows_with(patch.several, size, stride, border, space.wider, patch.former_near)
+    sort_scene(picture, returns, space, patch, now, space.changed, stride, size, border, left, top)
+    sort_scene(picture, returns, space, patch, former, patch.nowhere, stride, size, border, left, top)
     lost = f32(LOST_SHARE / LOST_DEPTH) * amplitudes[5]
     mask = 0.0
     if amplitudes[7] > 0:  # there are unknown things
-        mask = mask_nats(space, patch.label, patch.kind, stride, size, border)
-        mask -= mask_nats(space, patch.former_label, patch.former_kind, stride, size, border)
+        mask = mask_nats(space, now.label, now.kind, stride, size, border)
+        mask -= mask_nats(space, former.label, former.kind, stride, size, border)
     for k in range(len(fixed)):
         fixed[k] = mask
     for k in range(len(old)):
@@ -242,51 +210,22 @@ def _gain_of(
             for y in range(here[2], here[3]):
                 for x in range(here[0], here[1]):
                     k = (y - top) * stride + x - left
-                    touched |= space.seen[k] != 0 or patch.near_outline[k] != patch.former_near[k]
-                    if patch.kind[k] == CELL and patch.label[k] == NEW:
-                        metres += space.patch[k]
+                    touched |= space.seen[k] != 0 or now.near_outline[k] != former.near_outline[k]
+                    if now.kind[k] == CELL and now.label[k] == NEW:
+                        metres += now.depth[k]
                         pixels += 1
             if not touched:
                 continue
-            _score_pixels(
-                picture,
-                returns,
-                space,
-                space.patch,
-                patch.label,
-                patch.kind,
-                1.0,
-                here,
-                stride,
-                left,
-                top,
-                nodes,
-                fixed,
-            )
-            _score_pixels(
-                picture, returns, space, space.before, patch.former_label, patch.former_kind, -1.0, here, stride, left,
-                top, nodes, fixed,
-            )  # fmt: skip
+            _score_pixels(picture, returns, space, now, 1.0, here, stride, left, top, nodes, fixed)
+            _score_pixels(picture, returns, space, former, -1.0, here, stride, left, top, nodes, fixed)
             for label in (TABLE, OLD, NEW):
-                for now in range(2):
-                    if label == NEW and now == 0:
-                        continue
-                    if now:
-                        there = _gather(
-                            picture, returns, space, patch.near_outline, lost, space.patch, patch.label, patch.kind,
-                            f32(1.0), here, stride, left, top, label, batch, used,
-                        )  # fmt: skip
-                    else:
-                        there = _gather(
-                            picture, returns, space, patch.former_near, lost, space.before, patch.former_label,
-                            patch.former_kind, f32(-1.0), here, stride, left, top, label, batch, used,
-                        )  # fmt: skip
-                    if there:
+                for scene, sign in ((former, f32(-1.0)), (now, f32(1.0))):
+                    if _gather(picture, returns, space, scene, lost, sign, here, stride, left, top, label, batch, used):
                         used += 1
-                        if used == CELLS_SIDE_BY_SIDE:
-                            new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
-                            used = 0
-                            _clear(batch, returns_a_cell)
+                    if used == CELLS_SIDE_BY_SIDE:
+                        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+                        used = 0
+                        _clear(batch, returns_a_cell)
     if used > 0:
         new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
     metres = f32(metres / max(pixels, 1) / picture.focal_x)
@@ -314,12 +253,9 @@ def _shared_gain(frame):
     """See `gain.shared_gain`."""
     if answered_version(frame):
         return 0
-    things, planes, numbers, whole = _things_of(frame), floats(frame, 9), floats(frame, 14), integers(frame, 26)
+    things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 26)
     block, scene_rows, scene_columns, own_rows = whole[0], whole[1], whole[2], whole[3]
-    picture = Picture(
-        floats(frame, 10), integers(frame, 11), floats(frame, 12), floats(frame, 13)[:own_rows],
-        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
-    )  # fmt: skip
+    picture = picture_of(frame, own_rows)
     returns = Returns(
         floats(frame, 17), floats(frame, 18), floats(frame, 19), floats(frame, 20), len(floats(frame, 13)),
         len(picture.ray_x),
@@ -327,10 +263,11 @@ def _shared_gain(frame):
     nodes = (floats(frame, 21), floats(frame, 22), floats(frame, 23), floats(frame, 24), floats(frame, 25))
     scenes, ancestor = floats(frame, 15), integers(frame, 16)
     gain, warp = float_results(frame, 0), float_results(frame, 1)
-    count, objects = len(planes) // 4, _objects(things, planes)
+    count, objects = len(planes) // 4, objects_each(things, planes)
     height, width = len(picture.ray_y), len(picture.ray_x)
     space = new_space(height, width, 1, objects, most_corners(things))
-    patch, batch = new_patch(height, width, 1), new_batch(block * block)
+    patch, batch = new_patch(len(space.patch)), new_batch(block * block)
+    now, former = new_scene_pixels(space.patch), new_scene_pixels(space.before)
     pairs, tables, scales = len(nodes[0]), len(nodes[2]), len(nodes[3])
     own = new_object_cells(pairs, (height // block + 1) * (width // block + 1))
     fixed, old, sums = np.zeros(pairs * tables), np.zeros(pairs * scales), np.zeros(17)
@@ -342,8 +279,8 @@ def _shared_gain(frame):
     for n in range(count):
         _gain_of(
             things, n, objects, picture, returns, scenes, ancestor[n] * scene_rows * scene_columns, scene_columns,
-            block, nodes, space, patch, batch, own, fixed, old, sums, gain[n * levels : (n + 1) * levels],
-            warp[n * WARP : (n + 1) * WARP],
+            block, nodes, space, patch, now, former, batch, own, fixed, old, sums,
+            gain[n * levels : (n + 1) * levels], warp[n * WARP : (n + 1) * WARP],
         )  # fmt: skip
     return 0
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, log_marginal, shared_errors
-from bayes3d_ros.likelihood.noise_marginal import for_image, noise_grid
+from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, image_model, log_marginal
+from bayes3d_ros.likelihood.noise_marginal import noise_grid
 from bayes3d_ros.likelihood.scene_score import pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, log_prior
@@ -74,9 +74,8 @@ def planted_evidence(
 
 def model_of(seen: Observation, settings: ParserSettings) -> ImageModel:
     """The model of an image that the parser has."""
-    if seen.errors is None:
-        return for_image(noise_grid(settings.sigma_max), seen.image, settings.window)
-    return shared_errors(seen.image, seen.errors)
+    grid = noise_grid(settings.sigma_max)
+    return image_model(seen.image, jax.device_put(seen.image), seen.errors, grid, settings.window)
 
 
 @partial(jax.jit, static_argnames="window")
