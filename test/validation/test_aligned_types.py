@@ -34,19 +34,19 @@ def seen_of(mesh: trimesh.Trimesh, yaw: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_type_lies_on_itself(laid, yaw):
     for name, mesh in (("brick", trimesh.creation.box(BRICK)), ("tube", trimesh.creation.cylinder(*TUBE))):
         found = best_aligned(*seen_of(mesh, yaw), CAMERA, laid)
-        assert found.type == name and found.rms < 0.003 and found.seen_rms <= found.rms
+        assert found.type == name and found.rms < 0.0015 and found.back_rms < 0.003
         np.testing.assert_allclose(found.T_table_object[:2, 3], [0.12, -0.07], atol=0.003)
 
 
 def test_a_larger_box_is_as_far_as_it_is_larger(laid):
     found = best_aligned(*seen_of(trimesh.creation.box(np.array(BRICK) + [0.03, 0.03, 0]), 0.4), CAMERA, laid)
-    assert found.type == "brick" and 0.004 < found.rms < 0.015
+    assert found.type == "brick" and 0.003 < found.rms < 0.012
 
 
-def test_a_small_thing_that_lies_within_a_large_type_is_not_like_it(laid):
+def test_a_thing_that_is_a_part_of_a_type_is_near_to_it_one_way_alone(laid):
     small = trimesh.creation.box((0.09, 0.006, 0.135))  # as a side of the brick
     found = best_aligned(*seen_of(small, 0.4), CAMERA, laid)
-    assert found.rms > 0.008
+    assert found.rms < 0.005 and found.back_rms > 0.008
 
 
 def test_nothing_is_laid_onto_what_is_much_higher(laid):

@@ -157,7 +157,9 @@ def steps(quick: bool) -> Iterator[Step]:
 def job_row(job: Job, world: YcbWorld) -> Row:
     """Make a frame, parse it, and hold what is said against what is there."""
     row: Row = {"frame": job.seed, "kind": job.kind, "amplitude": job.amplitude}
-    row |= dict.fromkeys(("things", "aligned", "aligned_rms", "seen_rms", "listed", "claim", "ghosts", "false_claims"))
+    row |= dict.fromkeys(
+        ("things", "aligned", "aligned_rms", "aligned_back_rms", "listed", "claim", "ghosts", "false_claims")
+    )
     row |= dict.fromkeys(("unexplained", "log_evidence", "seconds", "error"))
     try:
         true = true_frame(job, world)
@@ -237,7 +239,7 @@ def alignment(true: TrueFrame, job: Job, world: YcbWorld) -> Row:
     found = best_aligned(seen, surface, T_table_camera[:3, 3], world.laid())
     if found is None:
         return {}
-    return {"aligned": found.type, "aligned_rms": round(found.rms, 6), "seen_rms": round(found.seen_rms, 6)}
+    return {"aligned": found.type, "aligned_rms": round(found.rms, 6), "aligned_back_rms": round(found.back_rms, 6)}
 
 
 def line(row: Row) -> str:

@@ -17,7 +17,7 @@ SEEN_POINTS = 200
 YAWS = 12
 SHORT_ROUNDS, LONG_ROUNDS = 5, 30  # of iterated closest points: from every start, and from the best ones
 FINALISTS = 12
-HEIGHTS_APART = 0.025  # metres: placements that are so much higher or lower than the thing are not tried
+HEIGHTS_APART = 0.05  # metres: placements that are so much higher or lower than the thing are not tried
 
 
 class AlignedType(NamedTuple):
@@ -25,8 +25,10 @@ class AlignedType(NamedTuple):
 
     type: str
     T_table_object: Float[np.ndarray, "4 4"]
-    rms: float  # metres; the larger one of the two directions
-    seen_rms: float  # of seen points from a type's surface alone, the least that any placement has
+    rms: float  # metres: of seen points from the type's surface
+    back_rms: (
+        float  # of the type's surface that faces the camera from the thing's: large where it is a part of the type
+    )
 
 
 class _Laid(NamedTuple):
@@ -66,22 +68,20 @@ def best_aligned(
 ) -> AlignedType | None:
     """The type that lies nearest, at rest on the table, to the points that are seen of a thing.
 
-    seen, and the thing's whole surface: table frame, as the camera's position. The distance is the larger of two: of
-    seen points from the type's surface, and of the type's surface that faces the camera from the thing's surface (RMS);
-    a small thing may lie within a large type, and is not like it. None where no type is about as high.
+    seen, and the thing's whole surface: table frame, as the camera's position. None where no type is about as high.
     """
     seen = seen[np.linspace(0, len(seen) - 1, min(SEEN_POINTS, len(seen))).astype(int)]
     top = np.quantile(seen[:, 2], 0.95)
     able = [own for own in laid if abs(np.quantile(own.points[:, 2], 0.95) - top) < HEIGHTS_APART]
     fits = [_started(seen, camera, own, yaw) for own in able for yaw in 2 * np.pi * np.arange(YAWS) / YAWS]
     finalists = sorted(fits, key=lambda fit: fit.rms)[:FINALISTS]
-    tree = cKDTree(surface)
     improved = [_improved(seen, fit, LONG_ROUNDS) for fit in finalists]
     if not improved:
         return None
-    seen_rms = min(fit.rms for fit in improved)
-    best = min((_judged(fit, tree, camera) for fit in improved), key=lambda found: found.rms)
-    return best._replace(seen_rms=seen_rms)
+    best = min(improved, key=lambda fit: fit.rms)
+    T = slide(best.x, best.y, best.yaw)
+    T_table_object = T @ best.laid.T_contact_object
+    return AlignedType(best.laid.model.name, T_table_object, best.rms, _back_rms(best, cKDTree(surface), camera))
 
 
 def _started(seen: Float[np.ndarray, "N 3"], camera: Float[np.ndarray, "3"], laid: _Laid, yaw: float) -> _Fit:
@@ -104,15 +104,23 @@ def _improved(seen: Float[np.ndarray, "N 3"], fit: _Fit, rounds: int) -> _Fit:
         a, b = own - own.mean(0), there - there.mean(0)
         yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
         x, y = there.mean(0) - slide(0.0, 0.0, yaw)[:2, :2] @ own.mean(0)
-    distance, _ = laid.tree.query((seen - [x, y, 0.0]) @ slide(0.0, 0.0, yaw)[:3, :3])
+    distance = _distance((seen - [x, y, 0.0]) @ slide(0.0, 0.0, yaw)[:3, :3], laid)
     return _Fit(float(np.sqrt((distance**2).mean())), laid, float(x), float(y), yaw)
 
 
-def _judged(fit: _Fit, surface: cKDTree, camera: Float[np.ndarray, "3"]) -> AlignedType:
-    """With the distance the other way round, of all that faces the camera."""
+def _distance(points: Float[np.ndarray, "N 3"], laid: _Laid) -> Float[np.ndarray, "N"]:
+    """Of points in the contact's frame from the type's surface, made of planes a voxel across."""
+    _, index = laid.tree.query(points)
+    off = points - laid.points[index]
+    along = (off * laid.normals[index]).sum(1)
+    across = np.linalg.norm(off - along[:, None] * laid.normals[index], axis=1)
+    return np.hypot(along, np.maximum(across - laid.model.voxel_size, 0))
+
+
+def _back_rms(fit: _Fit, surface: cKDTree, camera: Float[np.ndarray, "3"]) -> float:
+    """The distance the other way round, of all that faces the camera."""
     T = slide(fit.x, fit.y, fit.yaw)
     points = fit.laid.points @ T[:3, :3].T + T[:3, 3]
     facing = ((fit.laid.normals @ T[:3, :3].T) * (camera - points)).sum(1) > 0
     back, _ = surface.query(points[facing] if facing.any() else points)
-    rms = max(fit.rms, float(np.sqrt((back**2).mean())))
-    return AlignedType(fit.laid.model.name, T @ fit.laid.T_contact_object, rms, fit.rms)
+    return float(np.sqrt((back**2).mean()))
