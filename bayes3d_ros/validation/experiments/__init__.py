@@ -21,9 +21,11 @@ EXPERIMENTS: dict[str, str] = {
     "dial": "bayes3d_ros.validation.experiments.dial",
     "exactness": "bayes3d_ros.validation.experiments.exactness",
     "learning": "bayes3d_ros.validation.experiments.learning",
+    "open-world": "bayes3d_ros.validation.experiments.open_world",
     "parsing": "bayes3d_ros.validation.experiments.parsing",
     "planted": "bayes3d_ros.validation.experiments.planted",
     "repeatability": "bayes3d_ros.validation.experiments.repeatability",
+    "type-odds": "bayes3d_ros.validation.experiments.type_odds",
 }
 
 

@@ -2,6 +2,7 @@
 
 """Random tabletop scenes of one object, with correlated depth errors, to test what posteriors claim."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,8 +82,8 @@ def random_scene(thing: RestingObject, seed: int, noise: SensorNoise | None = No
     """
     place, view, errors, pixels = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     rest = int(place.integers(len(thing.downs)))
-    T_table_object = _put(thing, rest, place)
-    T_table_camera = _view(thing.mesh, T_table_object, view)
+    T_table_object = random_place(thing, rest, place)
+    T_table_camera = random_view(on_table(thing, T_table_object), view)
     noise = noise or random_noise(errors)
     clean = perfect_depth(thing, T_table_object, T_table_camera)
     depth = clean.depth + sample_correlated_errors(noise, 1, errors).at(clean, T_table_camera, REALSENSE)
@@ -104,21 +105,27 @@ def random_noise(rng: np.random.Generator) -> SensorNoise:
     )
 
 
-def _put(thing: RestingObject, rest: int, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
-    """T_table_object: at rest, its middle at a random place, turned by a random yaw."""
+def random_place(
+    thing: RestingObject, rest: int, rng: np.random.Generator, farthest: float = FARTHEST_FROM_MIDDLE
+) -> Float[np.ndarray, "4 4"]:
+    """T_table_object: at rest, its middle at a random place up to `farthest` metres off along x and y, any yaw."""
     yaw = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
     rotation = yaw @ turn(thing.downs[rest], np.array([0.0, 0.0, -1.0]))
-    return placed(thing.mesh, rotation, rng.uniform(-FARTHEST_FROM_MIDDLE, FARTHEST_FROM_MIDDLE, 2))
+    return placed(thing.mesh, rotation, rng.uniform(-farthest, farthest, 2))
 
 
-def _view(
-    mesh: trimesh.Trimesh, T_table_object: Float[np.ndarray, "4 4"], rng: np.random.Generator
+def on_table(thing: RestingObject, T_table_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "N 3"]:
+    """The mesh's vertices in the table's frame."""
+    return thing.mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
+
+
+def random_view(
+    points: Float[np.ndarray, "N 3"], rng: np.random.Generator, distances: tuple[float, float] = VIEW_DISTANCES
 ) -> Float[np.ndarray, "4 4"]:
-    """T_table_camera of a random camera that has all of the object in view."""
-    points = mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
+    """T_table_camera of a random camera, so many metres off, that has all points (table frame) in view."""
     middle = (points.min(0) + points.max(0)) / 2
     for _ in range(_VIEW_TRIALS):
-        distance, pitch = rng.uniform(*VIEW_DISTANCES), np.radians(rng.uniform(*VIEW_PITCHES))
+        distance, pitch = rng.uniform(*distances), np.radians(rng.uniform(*VIEW_PITCHES))
         azimuth = rng.uniform(0, 2 * np.pi)
         target = middle + np.append(rng.normal(0, AIM, 2), 0)
         T_table_camera = look_at(target + distance * direction(azimuth, pitch), target)
@@ -141,6 +148,11 @@ def perfect_depth(
 ) -> Rendering:
     """What is seen without errors: rays cast at the object (solid 0) where it is in view, and in closed form the
     table (solid 1) and the floor (solid 2)."""
+    return nearest([alone(thing, T_table_object, T_table_camera)], bare_depth(T_table_camera))
+
+
+def bare_depth(T_table_camera: Float[np.ndarray, "4 4"]) -> Rendering:
+    """The table (solid 0) and the floor (solid 1), in closed form."""
     rays = REALSENSE.rays().astype(np.float64)
     down = -(rays @ T_table_camera[2, :3])
     depth = np.where(down > 1e-6, T_table_camera[2, 3] / np.maximum(down, 1e-6), np.nan)
@@ -149,16 +161,33 @@ def perfect_depth(
         beside = (np.abs(across) > TABLE_SIDE / 2).any(-1)
     depth = np.where(beside, depth * (1 + TABLE_HEIGHT / T_table_camera[2, 3]), depth)
     cosine = np.where(down > 1e-6, down, np.nan) / np.linalg.norm(rays, axis=-1)
-    solid = np.where(np.isnan(depth), -1, np.where(beside, 2, 1))
+    return Rendering(depth, np.where(np.isnan(depth), -1, np.where(beside, 1, 0)), cosine)
 
-    points = thing.mesh.vertices @ T_table_object[:3, :3].T + T_table_object[:3, 3]
-    low, high = _extent(points, T_table_camera)
-    (u, v), (right, bottom) = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
-    crop = Intrinsics(REALSENSE.fx, REALSENSE.fy, REALSENSE.cx - u, REALSENSE.cy - v, int(right - u), int(bottom - v))
-    part = thing.caster.render(np.linalg.inv(T_table_object) @ T_table_camera, crop)
-    box = np.s_[v:bottom, u:right]
-    hit = part.solid == 0
-    depth[box] = np.where(hit, part.depth, depth[box])
-    cosine[box] = np.where(hit, part.cosine, cosine[box])
-    solid[box] = np.where(hit, 0, solid[box])
+
+def alone(
+    thing: RestingObject, T_table_object: Float[np.ndarray, "4 4"], T_table_camera: Float[np.ndarray, "4 4"]
+) -> Rendering:
+    """An object (solid 0) and nothing else, by rays cast where it is in view."""
+    shape = REALSENSE.height, REALSENSE.width
+    depth, solid, cosine = np.full(shape, np.nan), np.full(shape, -1), np.full(shape, np.nan)
+    low, high = _extent(on_table(thing, T_table_object), T_table_camera)
+    u, v = np.clip(np.floor(low), 0, shape[::-1]).astype(int)
+    right, bottom = np.clip(np.ceil(high) + 1, 0, shape[::-1]).astype(int)
+    if u < right and v < bottom:
+        crop = Intrinsics(
+            REALSENSE.fx, REALSENSE.fy, REALSENSE.cx - u, REALSENSE.cy - v, int(right - u), int(bottom - v)
+        )
+        part = thing.caster.render(np.linalg.inv(T_table_object) @ T_table_camera, crop)
+        box = np.s_[v:bottom, u:right]
+        depth[box], solid[box], cosine[box] = part
+    return Rendering(depth, solid, cosine)
+
+
+def nearest(objects: Sequence[Rendering], bare: Rendering) -> Rendering:
+    """What is seen of K objects, each rendered alone (solids 0 .. K - 1), before the table (K) and floor (K + 1)."""
+    depth, cosine = bare.depth.copy(), bare.cosine.copy()
+    solid = np.where(bare.solid < 0, -1, bare.solid + len(objects))
+    for k, own in enumerate(objects):
+        hit = (own.solid >= 0) & ((solid >= len(objects)) | (solid < 0) | (own.depth < depth))
+        depth[hit], cosine[hit], solid[hit] = own.depth[hit], own.cosine[hit], k
     return Rendering(depth, solid, cosine)

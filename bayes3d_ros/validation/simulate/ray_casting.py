@@ -63,28 +63,40 @@ class RayCaster:
 
     def render(self, T_world_camera: Float[np.ndarray, "4 4"], intrinsics: Intrinsics, far: float = 20.0) -> Rendering:
         """One ray through every pixel centre of a camera (optical frame); hits beyond `far` metres do not count."""
-        v, u = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
+        v, u = np.mgrid[: intrinsics.height, : intrinsics.width]
+        return self.cast(T_world_camera, np.stack([u, v], -1), intrinsics, far)
+
+    def cast(
+        self,
+        T_world_camera: Float[np.ndarray, "4 4"],
+        pixels: Float[np.ndarray, "*batch 2"],
+        intrinsics: Intrinsics,
+        far: float = 20.0,
+    ) -> Rendering:
+        """A ray through each of these points of the image (columns and rows, need not be whole), in their shape."""
+        u, v = pixels.reshape(-1, 2).T
         rays = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(len(u))], 1)
         length = np.linalg.norm(rays, axis=1)
         directions = rays / length[:, None] @ T_world_camera[:3, :3].T
         solid, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
         normal = np.zeros(3 * len(rays))
-        self._mujoco.mj_multiRay(
-            self._model,
-            self._data,
-            np.ascontiguousarray(T_world_camera[:3, 3], np.float64),
-            directions.ravel(),
-            None,
-            True,
-            -1,
-            solid,
-            distance,
-            normal,
-            len(rays),
-            far,
-        )
+        if len(rays):
+            self._mujoco.mj_multiRay(
+                self._model,
+                self._data,
+                np.ascontiguousarray(T_world_camera[:3, 3], np.float64),
+                directions.ravel(),
+                None,
+                True,
+                -1,
+                solid,
+                distance,
+                normal,
+                len(rays),
+                far,
+            )
         hit = solid >= 0
         cosine = np.abs((normal.reshape(-1, 3) * directions).sum(1))
-        shape = (intrinsics.height, intrinsics.width)
+        shape = pixels.shape[:-1]
         depth = np.where(hit, distance / length, np.nan)
         return Rendering(depth.reshape(shape), solid.reshape(shape), np.where(hit, cosine, np.nan).reshape(shape))
