@@ -18,7 +18,7 @@ KEYS = [
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes", "explained", "size", "size_sigma",
+    "face_probabilities", "modes", "explained", "size", "size_sigma", "table_position",
 ]  # fmt: skip
 
 
