@@ -89,7 +89,8 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
         surfaces = dict(zip(things, oriented, strict=True))
     while True:
         if not surfaces:
-            raise LearningError(_nothing_left(refused))
+            reasons = "; ".join(f"view {k + 1}: {why}" for k, why in sorted(refused.items()))
+            raise LearningError(f"none of {len(frames)} views can be used: {reasons}")
         used = sorted(surfaces)
         shifts = dict(zip(used, align_views([surfaces[k] for k in used]), strict=True))
         aligned = {k: moved(surfaces[k], shifts[k]) for k in used}
@@ -116,13 +117,6 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
     )
     model, T_table_object = _model(name, fused, reports, settings)
     return Learned(model, T_table_object, reports, float((fused.views > 0).mean()))
-
-
-def _nothing_left(refused: dict[int, str]) -> str:
-    """Why no view can be used: of the first three, as ten would make a long line."""
-    reasons = [f"view {k + 1}: {why}" for k, why in sorted(refused.items())]
-    more = [f"and {len(reasons) - 3} more"] if len(reasons) > 3 else []
-    return f"none of {len(reasons)} views can be used: {'; '.join([*reasons[:3], *more])}"
 
 
 def _segmented(frame: DepthFrame, settings: LearnerSettings) -> View | str:
@@ -152,7 +146,8 @@ def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) ->
 
 
 def choose_things(views: dict[int, View], settings: LearnerSettings) -> tuple[dict[int, Thing], dict[int, str]]:
-    """In every view the thing to learn (`choose_thing`), and of those that do not show it, why."""
+    """In every view the thing to learn (`choose_thing`), and of those that do not show it, why. Raises LearningError
+    where no view shows it."""
     chosen: dict[int, Thing] = {}
     missing: dict[int, str] = {}
     for k, view in views.items():
@@ -160,6 +155,9 @@ def choose_things(views: dict[int, View], settings: LearnerSettings) -> tuple[di
             chosen[k] = choose_thing(view, list(chosen.values()), settings)
         except ViewError as error:
             missing[k] = str(error)
+    if missing and not chosen:  # one line: the others say the same
+        others = len(missing) - 1
+        raise LearningError(next(iter(missing.values())) + (f"; nor in {others} other views" * (others > 0)))
     return chosen, missing
 
 

@@ -38,11 +38,11 @@ from bayes3d_ros.ros.spinning import shut_down
 from bayes3d_ros.ros.transport import use_large_messages
 
 KNOWN = ("003_cracker_box", "006_mustard_bottle")
-HIDDEN_NAME = "035_power_drill"  # in the scene, and not in the library
-NEW_NAME = "my_drill"  # what it is learned as
+NEW_NAME = "my_drill"  # what the third thing, a power drill, is learned as
 KNOWN_WITHIN, SAME_PLACE = 0.01, 0.05  # metres: ADD-S of the known objects; of the third one, between two tellings
 SERVICE_SECONDS = 60.0
 AGAIN_SECONDS = 5.0  # a frame is published again if it has not come by then: DDS may connect late
+TELL_SECONDS = 20.0  # between two lines about what scene_parser does meanwhile
 _LEARNER = "/object_learner: object learning"
 
 
@@ -71,7 +71,7 @@ class Told(NamedTuple):
         return places[0]
 
 
-class Table:
+class DemoTable:
     """The two nodes as processes, and a camera that shows them one recorded frame after the other."""
 
     def __init__(self, bag: Path, library: Path, out: Path, say: Callable[[str], None]) -> None:
@@ -98,7 +98,7 @@ class Table:
         self._start("scene_parser", out, library=library, **size)
         self._start("object_learner", out, library=library, object_name=NEW_NAME, max_age=600.0)
 
-    def __enter__(self) -> "Table":
+    def __enter__(self) -> "DemoTable":
         return self
 
     def __exit__(
@@ -188,7 +188,7 @@ class Table:
     def _wait(
         self, done: Callable[[], bool], what: str, seconds: float, again: Callable[[], None] = lambda: None
     ) -> None:
-        """Spin until something is done, and say what scene_parser says; `again` is called at once and every few seconds."""
+        """Spin until something is done; `again` is called at once and again. Tells what scene_parser says."""
         start = told_at = time.monotonic()
         called_at, told = -np.inf, ""
         while not done():
@@ -198,7 +198,7 @@ class Table:
                 again()
             self._executor.spin_once(timeout_sec=0.1)
             diagnosis = self._outputs.diagnosis
-            if now - told_at > 10 and diagnosis != told:
+            if now - told_at > TELL_SECONDS and diagnosis != told:
                 told_at, told = now, diagnosis
                 self._say(f"   (scene_parser: {diagnosis})")
             for name, process in self._processes.items():
@@ -210,18 +210,18 @@ class Table:
 
 def run_unknown_demo(out: Path, say: Callable[[str], None]) -> None:
     """Tell an unknown thing as such, learn it from two views, and find it by its name; writes OUT/before.png,
-    new_object.png and after.png, the library and the logs of both nodes.
+    new_object.png and after.png, the library known_objects and the logs of both nodes.
 
     `say` is called with lines for a person. Raises DemoError with one line where the story does not hold.
     """
     out.mkdir(parents=True, exist_ok=True)
-    bag, library = share_directory() / "bags" / "unknown_object", out / "library"
+    bag, library = share_directory() / "bags" / "unknown_object", out / "known_objects"
     demo_library(library, say, KNOWN)
     model_path(library, NEW_NAME).unlink(missing_ok=True)  # an earlier run's
     CaptureStore(library / "captures" / NEW_NAME).clear()
     say(f"On the table: {', '.join(KNOWN)}, and a drill. The library holds the first two only.")
     say("Starting scene_parser and object_learner; the first start on a machine compiles for a minute or two.")
-    with Table(bag, library, out, say) as table:
+    with DemoTable(bag, library, out, say) as table:
         table.connect()
         say("1. scene_parser parses a first view:")
         table.show(0)
