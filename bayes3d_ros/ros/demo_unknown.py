@@ -118,8 +118,12 @@ class DemoTable:
 
     def connect(self) -> None:
         """Wait until both nodes listen to the camera; scene_parser compiles before it does."""
-        for name, publisher in self._camera.items():
-            self._wait(lambda p=publisher: p.get_subscription_count() > 1, f"two subscribers of {name}", START_SECONDS)  # type: ignore[misc]
+        cameras = self._camera.values()
+        self._wait(
+            lambda: all(publisher.get_subscription_count() > 1 for publisher in cameras),
+            "two subscribers of every topic of the camera",
+            START_SECONDS,
+        )
 
     def show(self, k: int) -> None:
         """Publish frame k as it was recorded, until object_learner has it (scene_parser gets the same messages)."""
