@@ -1,6 +1,7 @@
 # make setup   a virtual environment in .venv with everything in it (demo, test, lint and colcon do it first)
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
 # make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
+# make demo-unknown  meet an object that no library holds, learn it from two views, find it; results in out/demo-unknown
 # make test    all tests, two files at a time;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
@@ -19,7 +20,7 @@ COLCON_TESTS :=
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo demo-learn test lint colcon clean
+.PHONY: help setup demo demo-learn demo-unknown test lint colcon clean
 help:
 	@sed -n 's/^# \(make\)/\1/p' Makefile
 
@@ -49,6 +50,9 @@ demo-learn: setup
 	    $(BIN)/bayes3d learn bags/views_$$name --name $$name --library $(OUT)-learn/library --replace || exit; \
 	done
 	$(BIN)/bayes3d parse bags/three_objects --library $(OUT)-learn/library --out $(OUT)-learn/parsed
+
+demo-unknown: setup
+	$(BIN)/bayes3d demo --unknown --out $(OUT)-unknown
 
 test: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)

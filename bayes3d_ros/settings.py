@@ -2,6 +2,7 @@
 
 """Settings of the algorithms: frozen dataclasses, from which ROS parameters and yaml files are derived."""
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -23,6 +24,11 @@ def retirement(name: str, known: Collection[str]) -> str:
     """What to tell somebody who gives a retired name; empty where it is none, or the new one is not among the known."""
     new = RETIRED.get(name)
     return f"this name is retired, use {new}" if new in known else ""
+
+
+class UnfinishedSettings(ValueError):
+    """Settings that belong together, of which only some are given: nothing can be done with them, but the others may
+    follow, as `ros2 param set` sets one at a time."""
 
 
 def setting(default: Any, description: str, *, unit: str = "", low: Any = None, high: Any = None, choices=()) -> Any:
@@ -189,6 +195,13 @@ class LearnerSettings:
         "which of several things to learn: refuse to choose, the largest, or the one nearest to the workspace's middle",
         choices=("only", "largest", "central"),
     )
+    at_x: float = setting(
+        math.nan,
+        "with at_y: learn the thing nearest to this place on the table, whatever cluster says; along x of the table "
+        "frame, as in table_position of scene_parser's results; .nan for no place",
+        unit="m",
+    )
+    at_y: float = setting(math.nan, "the same along y; .nan for no place", unit="m")
     max_shift: float = setting(
         0.03, "largest error of a camera pose that is corrected, at the object", unit="m", low=0.0, high=0.5
     )
@@ -197,6 +210,26 @@ class LearnerSettings:
     def __post_init__(self) -> None:
         validate(self)
         _near_before_far(self.near, self.far)
+        axes = (
+            ("at_x", "width", self.workspace_x),
+            ("at_y", "depth", self.workspace_y),
+        )
+        for name, extent_name, middle in axes:
+            value, extent = getattr(self, name), getattr(self, f"workspace_{extent_name}")
+            if math.isinf(value):
+                raise ValueError(f"{name} must be finite, or nan for no place, got {value}")
+            if abs(value - middle) > extent / 2:  # not where it is NaN
+                low, high = middle - extent / 2, middle + extent / 2
+                inside = f"the workspace (workspace_{name[-1]}, workspace_{extent_name})"
+                raise ValueError(f"{name} must lie in {inside}, from {low:g} to {high:g} m, got {value:g}")
+        if math.isnan(self.at_x) != math.isnan(self.at_y):
+            given, missing = ("at_y", "at_x") if math.isnan(self.at_x) else ("at_x", "at_y")
+            raise UnfinishedSettings(f"{given} is given without {missing}: expected both, or neither")
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """x and y in the table frame, metres, of the thing to learn; None where no place is given."""
+        return None if math.isnan(self.at_x) else (self.at_x, self.at_y)
 
 
 @dataclass(frozen=True)

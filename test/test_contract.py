@@ -29,7 +29,7 @@ SCENE_KEYS = {
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
-    *("face_probabilities", "modes", "explained", "size", "size_sigma"),
+    *("face_probabilities", "modes", "explained", "size", "size_sigma", "table_position"),
 }
 MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
 FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma", "sx", "sy", "sz")

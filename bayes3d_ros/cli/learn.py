@@ -2,6 +2,7 @@
 
 """`bayes3d learn`: a model of an object from views of it."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,13 @@ from bayes3d_ros.cli.progress import progress
 @click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
 @click.option("--views", type=click.IntRange(1, 10), default=10, show_default=True, help="Most views to use.")
 @click.option("--cluster", type=click.Choice(["only", "largest", "central"]), help="Which of several things to learn.")
+@click.option(
+    "--at",
+    nargs=2,
+    type=float,
+    metavar="X Y",
+    help="Learn the thing nearest to this place: metres in the table frame, as table_position in scenes.jsonl.",
+)
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
 @replace_option
 def learn(
@@ -28,6 +36,7 @@ def learn(
     library: Path,
     topic: str | None,
     views: int,
+    at: tuple[float, float] | None,
     more: tuple[str, ...],
     replace: bool,
     **options: Any,
@@ -43,6 +52,10 @@ def learn(
     check_name(name)
     if not replace:
         refuse_existing(library, name)
+    if at is not None:
+        if any(map(math.isnan, at)):
+            raise InputError(f"--at: expected two numbers, metres in the table frame, got {at[0]:g} {at[1]:g}")
+        options |= {"at_x": at[0], "at_y": at[1]}
     settings = settings_from(LearnerSettings, more, options)
     reader = read_frames(bag, topic)
     poses = [frame.T_table_camera for frame in progress(reader, len(reader), "frame")]
@@ -61,6 +74,8 @@ def learn(
     model, size = learned.model, " x ".join(f"{v:.3f}" for v in learned.model.box_size)
     used = sum(not view.refused for view in learned.views)
     click.echo(f"{name}: {size} m, {len(model.surface_index)} surface voxels, {learned.coverage:.0%} of them seen")
+    for note in learned.notes:
+        click.echo(f"{name}: {note}")
     title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
     click.echo(f"{save_model(model, library, replace=replace)}")
     click.echo(f"{plot_model(model, library / f'{name}.png', title)}")

@@ -18,9 +18,11 @@ def recording_line(frames: "FrameReader") -> str:
 
 
 def frame_line(posterior: "ScenePosterior") -> str:
-    """A parsed frame: p(exists) of every listed object, and p(type) given that it exists."""
+    """A parsed frame: p(exists) of every listed object, and p(type) given that it exists; of unknown things also where
+    they are, for `bayes3d learn --at X Y`."""
     objects = (
         f"{o.type} p(exists) {o.probability:.2f} p(type) {o.type_probabilities.get(o.type, 0.0):.2f}"
+        + (" at x {:.3f} y {:.3f} m on the table".format(*posterior.table_position(o)) if o.is_unknown else "")
         for o in posterior.objects
     )
     found = ", ".join(objects) or f"no object p(n = 0) {posterior.num_objects.get(0, 0.0):.2f}"

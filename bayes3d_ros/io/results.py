@@ -37,7 +37,7 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "num_objects": {str(n): json_number(p) for n, p in posterior.num_objects.items()},
         "num_unknown": {str(n): json_number(p) for n, p in posterior.num_unknown.items()},
         "noise": {"p_outlier": json_number(posterior.p_outlier), "sigma": json_number(posterior.sigma)},
-        "objects": [_object_record(found) for found in posterior.objects],
+        "objects": [_object_record(found, posterior.table_position(found)) for found in posterior.objects],
         "T_camera_table": json_numbers(posterior.T_camera_table),
         "ess": json_numbers(posterior.ess),
         "usable_share": json_number(posterior.usable_share),
@@ -46,7 +46,7 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
     }
 
 
-def _object_record(found: ObjectEstimate) -> dict[str, Any]:
+def _object_record(found: ObjectEstimate, table_position: Float[np.ndarray, "3"]) -> dict[str, Any]:
     return {
         "type": found.type,
         "type_probabilities": {name: json_number(p) for name, p in found.type_probabilities.items()},
@@ -60,6 +60,7 @@ def _object_record(found: ObjectEstimate) -> dict[str, Any]:
         "explained": json_number(found.explained),
         "size": None if found.size is None else json_numbers(found.size),
         "size_sigma": None if found.size_sigma is None else json_numbers(found.size_sigma),
+        "table_position": json_numbers(table_position),
     }
 
 

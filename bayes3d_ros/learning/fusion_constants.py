@@ -17,6 +17,9 @@ SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises a
 FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
 FOOT_WITHIN = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
 NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
+# Metres on the table from the place that is asked for to the nearest return of the thing there: `max_shift`, by which a
+# view's camera pose may be off, and 2 cm for the place itself.
+AT_WITHIN = 0.05
 
 # Camera poses (`align.py`)
 POSE_PRIOR = 0.015, 0.015, np.deg2rad(0.8)  # standard deviations of a pose's error at the object: m, m, radians

@@ -17,7 +17,17 @@ from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
 from bayes3d_ros.learning.fusion_constants import CONTRADICTED, SEEN_THROUGH
-from bayes3d_ros.learning.segment import Surface, Thing, View, ViewError, middle, segment, surface
+from bayes3d_ros.learning.segment import (
+    Surface,
+    Thing,
+    View,
+    ViewError,
+    middle,
+    places_of,
+    segment,
+    surface,
+    thing_at,
+)
 from bayes3d_ros.objects.mesh_import import contact_normals
 from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel, is_reserved
 from bayes3d_ros.settings import LearnerSettings
@@ -38,6 +48,7 @@ class ViewReport:
     shift: float  # metres by which its pose was corrected, at the object
     turn: float  # radians
     refused: str = ""  # why nothing of it is in the model
+    cut_off: bool = False  # whether the object reaches the border of the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +59,17 @@ class Learned:
     T_table_object: Float[np.ndarray, "4 4"]  # where it stood
     views: tuple[ViewReport, ...]
     coverage: float
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of this model, one line each."""
+        used = {number: view for number, view in enumerate(self.views, 1) if not view.refused}
+        one = (
+            "learned from one view: the side that it hides is unknown, and closed by the convex hull of what was seen",
+        )
+        cut = [f"view {k}" for k, view in used.items() if view.cut_off]
+        beyond = (f"the border of the image cuts the object off in {', '.join(cut)}: what is beyond is not seen",)
+        return (*(one if len(used) == 1 else ()), *(beyond if cut else ()))
 
 
 def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | None = None) -> Learned:
@@ -61,7 +83,8 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
         parts = list(pool.map(lambda frame: _segmented(frame, settings), frames))
         views = {k: part for k, part in enumerate(parts) if isinstance(part, View)}
         refused = {k: part for k, part in enumerate(parts) if isinstance(part, str)}
-        things = choose_things(views, settings)
+        things, missing = choose_things(views, settings)
+        refused |= missing
         oriented = pool.map(lambda k: surface(views[k], things[k]), things)
         surfaces = dict(zip(things, oriented, strict=True))
     while True:
@@ -84,7 +107,12 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
     reports = tuple(
         ViewReport(frame.stamp_ns, 0, 0.0, 0.0, refused[k])
         if k in refused
-        else ViewReport(frame.stamp_ns, len(things[k].points), *_correction(frame, poses[k], aligned[k]))
+        else ViewReport(
+            frame.stamp_ns,
+            len(things[k].points),
+            *_correction(frame, poses[k], aligned[k]),
+            cut_off=things[k].cut_off,
+        )
         for k, frame in enumerate(frames)
     )
     model, T_table_object = _model(name, fused, reports, settings)
@@ -117,25 +145,38 @@ def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) ->
     return sorted(there[k] for k in chosen)
 
 
-def choose_things(views: dict[int, View], settings: LearnerSettings) -> dict[int, Thing]:
-    """In every view the thing to learn: as `cluster` says in the first, in the others the one that stands there."""
+def choose_things(views: dict[int, View], settings: LearnerSettings) -> tuple[dict[int, Thing], dict[int, str]]:
+    """In every view the thing to learn (`choose_thing`), and of those that do not show it, why. Raises LearningError
+    where no view shows it."""
     chosen: dict[int, Thing] = {}
+    missing: dict[int, str] = {}
     for k, view in views.items():
-        chosen[k] = choose_thing(view, list(chosen.values()), settings)
-    return chosen
+        try:
+            chosen[k] = choose_thing(view, list(chosen.values()), settings)
+        except ViewError as error:
+            missing[k] = str(error)
+    if missing and not chosen:  # one line: the others say the same
+        others = len(missing) - 1
+        raise LearningError(next(iter(missing.values())) + (f"; nor in {others} other views" * (others > 0)))
+    return chosen, missing
 
 
 def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings) -> Thing:
-    """The thing to learn of those in a view, given what was chosen in the views before. Raises LearningError where
-    there are several to begin with and `cluster` is "only"."""
+    """The thing to learn of those in a view, given what was chosen in the views before.
+
+    With a place (`at_x`, `at_y`) it is in every view the thing nearest to that place (`thing_at`); ViewError where
+    there is none. Without one it is in the first view as `cluster` says, and in the others the one whose middle is
+    nearest to what was chosen before; LearningError where there are several to begin with and `cluster` is "only".
+    """
+    if settings.place is not None:
+        return thing_at(view, settings.place)
     if before:
         return _nearest(view.things, np.mean([middle(thing.points) for thing in before], 0))
     if settings.cluster == "central":
         return _nearest(view.things, np.array([settings.workspace_x, settings.workspace_y]))
     if settings.cluster == "only" and len(view.things) > 1:
-        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in (middle(thing.points) for thing in view.things))
         raise LearningError(
-            f"{len(view.things)} things stand in the workspace, at x, y = {places} m: expected one, "
+            f"{places_of(view.things)}: expected one, or the place of the one to learn (at_x, at_y; --at X Y), "
             "or cluster largest or central, or a smaller workspace"
         )
     return view.things[0]
@@ -230,7 +271,7 @@ def _model(
             "kind": "views",
             "views": told,
             "surface_voxels_by_views": counts.tolist(),
-            "settings": asdict(settings),
+            "settings": asdict(settings) | ({"at_x": None, "at_y": None} if settings.place is None else {}),  # no NaN
         },
         surface_views=fused.views,
     )

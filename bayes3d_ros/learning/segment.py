@@ -2,6 +2,7 @@
 
 """What one calibrated depth view shows of things on the table: their surface points, in the table frame."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy import ndimage
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.learning.fusion_constants import (
+    AT_WITHIN,
     EDGE_SHARE,
     FEWEST_PIXELS,
     FIRM,
@@ -35,6 +37,7 @@ class Thing(NamedTuple):
 
     points: Float[np.ndarray, "N 3"]  # table frame
     pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]  # rows, columns
+    cut_off: bool  # whether it reaches the border of the image, so that a part of it may be outside
 
 
 class Surface(NamedTuple):
@@ -85,7 +88,12 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
             f"{1e3 * lowest:.0f} mm above it, expected at least {FEWEST_PIXELS} together)"
         )
     pixels = [np.nonzero(labels == k) for k in found]
-    return View(frame, T_table_camera, tuple(Thing(local[where], where) for where in pixels))
+    return View(frame, T_table_camera, tuple(_thing(local, where) for where in pixels))
+
+
+def _thing(local: Float[np.ndarray, "H W 3"], pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]) -> Thing:
+    on_border = any((at == 0).any() or (at == size - 1).any() for at, size in zip(pixels, local.shape[:2], strict=True))
+    return Thing(local[pixels], pixels, on_border)
 
 
 def surface(view: View, thing: Thing) -> Surface:
@@ -113,6 +121,38 @@ def surface(view: View, thing: Thing) -> Surface:
     normals = np.linalg.eigh(second)[1][..., 0]
     away = np.einsum("ni,ni->n", normals, thing.points - view.T_table_camera[:3, 3]) > 0
     return Surface(thing.points, np.where(away[:, None], -normals, normals))
+
+
+def thing_at(view: View, place: tuple[float, float]) -> Thing:
+    """The thing nearest to a place on the table (x, y in the table frame, metres).
+
+    How near a thing is: the distance in the table's plane (heights do not count) from the place to the nearest of the
+    thing's returns in this view, so 0 for a place under what is seen of it. Raises ViewError, which names the place and
+    where things stand, if the nearest is farther than `AT_WITHIN`: then it is hidden in this view, or is not there.
+
+    Things that touch, or stand closer to each other than the setting `gap`, are one thing here. Of a thing that the
+    image's border cuts only the part inside is there (`Thing.cut_off`): the place has to be near that part.
+
+    The table frame is that of the view's camera pose, and the same in all views of a camera that moves, as far as
+    their poses are right. Correcting a pose by the table that is seen moves x and y of what stands there by its height
+    times the tilt that was wrong, at most some millimetres.
+    """
+    distances = [float(np.hypot(*(thing.points[:, :2] - place).T).min()) for thing in view.things]
+    nearest = int(np.argmin(distances))
+    if distances[nearest] > AT_WITHIN:
+        x, y = place
+        raise ViewError(
+            f"nothing stands within {1e3 * AT_WITHIN:.0f} mm of the place x {x:.2f} y {y:.2f} m (at_x, at_y; --at); "
+            f"{places_of(view.things)}, the nearest {1e3 * distances[nearest]:.0f} mm away"
+        )
+    return view.things[nearest]
+
+
+def places_of(things: Sequence[Thing]) -> str:
+    """Where things stand, in words."""
+    count = f"{len(things)} things stand" if len(things) > 1 else "1 thing stands"
+    places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in (middle(thing.points) for thing in things))
+    return f"{count} in the workspace, at x, y = {places} m"
 
 
 def middle(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "2"]:

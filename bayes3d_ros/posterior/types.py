@@ -120,6 +120,14 @@ class ScenePosterior:
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
 
+    def table_position(self, found: ObjectEstimate) -> Float[np.ndarray, "3"]:
+        """Where an object's origin is in the table's frame, metres; NaN where the table's pose is not known.
+
+        Of an unknown thing this is the centre of its box's base. object_learner takes x and y as its at_x and at_y:
+        with a camera pose the frame is the pose's, raised and tilted to the plane that the returns show."""
+        T = self.T_camera_table
+        return np.asarray((found.position - T[:3, 3]) @ T[:3, :3], float)
+
     @property
     def too_little_usable(self) -> bool:
         """Whether so few pixels on the table could be used that objects may be missed or mistaken."""

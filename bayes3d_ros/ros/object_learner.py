@@ -25,7 +25,7 @@ from bayes3d_ros.learning.learn import (
     learn,
     new_share,
 )
-from bayes3d_ros.learning.segment import Thing, ViewError, segment
+from bayes3d_ros.learning.segment import Thing, ViewError, middle, segment
 from bayes3d_ros.objects.model import LibraryError
 from bayes3d_ros.objects.store import learned_from, load_model, model_path, refuse_existing, save_model
 from bayes3d_ros.ros.arguments import check_arguments
@@ -127,9 +127,11 @@ class ObjectLearnerNode(Node):
         seen[frame.stamp_ns] = thing
         others = len(view.things) - 1
         beside = f", {others} other thing{'s' * (others > 1)} left out" if others else ""
+        cut = ", which the border of the image cuts off" if thing.cut_off else ""
+        x, y = middle(thing.points)
         return (
-            f"view {len(seen)} of {store.folder.name}: {len(thing.points)} points on the object, "
-            f"{fresh:.0%} of its surface not seen before{beside}"
+            f"view {len(seen)} of {store.folder.name}: {len(thing.points)} points on the object at "
+            f"x {x:.2f} y {y:.2f} m{cut}, {fresh:.0%} of its surface not seen before{beside}"
         )
 
     def _build(self) -> str:
@@ -147,10 +149,10 @@ class ObjectLearnerNode(Node):
         refused = [f"view {k} left out: {v.refused}" for k, v in enumerate(learned.views, 1) if v.refused]
         off = max((view.shift for view in learned.views if not view.refused), default=0.0)
         done = (
-            f"{path}: {used} views, {size} m, {learned.coverage:.0%} of the surface seen, "
+            f"{path}: {used} view{'s' * (used != 1)}, {size} m, {learned.coverage:.0%} of the surface seen, "
             f"camera poses corrected by up to {1e3 * off:.0f} mm"
         )
-        return "; ".join([done, *refused, *problems])
+        return "; ".join([done, *learned.notes, *refused, *problems])
 
     def _may_replace(self, name: str, captured: set[int]) -> bool:
         """Whether a model may be written over: where `replace` says so, or where it was learned from views that are all
@@ -294,8 +296,13 @@ class ObjectLearnerNode(Node):
         if self._newest.pose.T_table_camera is None:
             why = self._newest.pose.problem or "expected one from the camera_pose topic, tf or the parameter"
             return WARN, f"no camera pose for the newest image: {why}"
+        try:
+            place = self._parts.settings.read(LearnerSettings).place
+        except ValueError as error:
+            return WARN, str(error)
+        ready = "ready to capture" + ("" if place is None else f" the thing at x {place[0]:.3f} y {place[1]:.3f} m")
         told = input_warnings(view)
-        return (WARN, f"ready to capture; {'; '.join(told)}") if told else (OK, "ready to capture")
+        return (WARN, f"{ready}; {'; '.join(told)}") if told else (OK, ready)
 
 
 def main(args: list[str] | None = None) -> int:

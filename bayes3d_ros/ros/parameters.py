@@ -23,6 +23,7 @@ from bayes3d_ros.settings import (
     LearnerSettings,
     ParserSettings,
     TrackerSettings,
+    UnfinishedSettings,
     retirement,
     setting,
     validate,
@@ -163,13 +164,16 @@ class SettingsParameters:
         return self._build(kind, {})
 
     def check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Whether these values may be set: for add_on_set_parameters_callback."""
+        """Whether these values may be set: for add_on_set_parameters_callback. A value that waits for another one may;
+        `read` refuses it until the other one is set."""
         changed = {p.name: p.value for p in parameters}
-        try:
-            for kind in self._kinds:
+        for kind in self._kinds:
+            try:
                 self._build(kind, changed)
-        except ValueError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            except UnfinishedSettings:
+                continue
+            except ValueError as error:
+                return SetParametersResult(successful=False, reason=str(error))
         for name in changed:
             self.problems.pop(name, None)
         return SetParametersResult(successful=True)
@@ -194,6 +198,8 @@ class SettingsParameters:
             try:
                 self._build(kind, {})
                 return
+            except UnfinishedSettings:
+                return  # `read` refuses them until the others are set
             except ValueError as error:
                 name = re.split(r"\W", str(error), maxsplit=1)[0]  # errors begin with the setting's name
                 if name not in named or name in self.problems:
@@ -267,7 +273,8 @@ def _typed(field: Field, value: Any) -> Any:
     expected = type(field.default)
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if expected is float and number:
-        if not math.isfinite(value):
+        may_be_unset = isinstance(field.default, float) and math.isnan(field.default)
+        if not math.isfinite(value) and not (may_be_unset and math.isnan(value)):
             raise ValueError(f"{field.name} must be finite, got {value}")
         return float(value)
     if expected is tuple:

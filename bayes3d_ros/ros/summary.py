@@ -37,7 +37,7 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
         scene.values.insert(1, KeyValue(key="p n unknown", value=unknown))
     scene.values += [KeyValue(key=UNEXPLAINED, value=place_words(place)) for place in posterior.unexplained]
     scene.values += [KeyValue(key="note", value=note) for note in posterior.notes]
-    objects = [_object_status(k, o, posterior.frame_id) for k, o in enumerate(posterior.objects, start=1)]
+    objects = [_object_status(k, o, posterior) for k, o in enumerate(posterior.objects, start=1)]
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])
 
 
@@ -52,15 +52,16 @@ def place_from_words(words: str) -> UnexplainedPlace:
     return UnexplainedPlace(float(x), float(y), float(z), int(pixels))
 
 
-def _object_status(label: int, estimate: ObjectEstimate, frame_id: str) -> DiagnosticStatus:
+def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosterior) -> DiagnosticStatus:
     sigma_position, sigma_rotation = _sigmas(estimate.covariance)
-    status = DiagnosticStatus(name=f"{label} {estimate.type}", hardware_id=frame_id)
+    status = DiagnosticStatus(name=f"{label} {estimate.type}", hardware_id=posterior.frame_id)
     status.message = f"p(exists) {estimate.probability:.3f}"
     status.values = key_values(
         p_exists=f"{estimate.probability:.4f}",
         explained=f"{estimate.explained:.3f}",
         p_type=" ".join(f"{name}: {p:.3f}" for name, p in estimate.type_probabilities.items()),
         position_m=spaced(estimate.position, 4),
+        table_position_m=spaced(posterior.table_position(estimate), 4),
         orientation_xyzw=spaced(estimate.orientation, 4),
         sigma_position_mm=sigma_position,
         sigma_rotation_deg=sigma_rotation,

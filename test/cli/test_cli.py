@@ -336,9 +336,10 @@ def test_help_does_not_load_what_is_heavy():
     assert loaded.strip() == "[]"
 
 
-def test_the_demo_without_ros_says_what_to_install(tmp_path, monkeypatch):
+@pytest.mark.parametrize("options", [(), ("--unknown",)])
+def test_the_demo_without_ros_says_what_to_install(tmp_path, monkeypatch, options):
     monkeypatch.setitem(sys.modules, "bayes3d_ros.ros.demo", None)
-    assert_one_line(run("demo", "--out", tmp_path / "out"), 1, "ROS 2 Jazzy")
+    assert_one_line(run("demo", "--out", tmp_path / "out", *options), 1, "ROS 2 Jazzy")
 
 
 def test_learn_writes_a_model_and_its_picture(tmp_path):
@@ -355,6 +356,17 @@ def test_learn_writes_a_model_and_its_picture(tmp_path):
     assert run("learn", bag, *options, "--replace").exit_code == 0
 
 
+def test_learn_at_a_place_from_one_view(tmp_path):
+    """The drill, between a mustard bottle and a cracker box."""
+    bag = share_directory() / "bags" / "unknown_object"
+    options = ["--name", "drill", "--library", tmp_path, "--voxel-size", "0.006", "--views", "1", "--at", "0", "-0.1"]
+    result = run("learn", bag, *options)
+    assert result.exit_code == 0, result.output
+    assert "drill: learned from one view: the side that it hides is unknown" in result.stdout
+    (model,) = load_library(tmp_path).models
+    assert model.box_size[2] < 0.08 < model.box_size[0]  # it lies
+
+
 def test_learn_refuses_a_name_that_exists_before_it_reads_anything(library, tmp_path):
     before = (library / "block.npz").read_bytes()
     result = run("learn", tmp_path / "no_bag", "--name", "block", "--library", library)
@@ -369,7 +381,15 @@ def test_learn_refuses_a_name_that_exists_before_it_reads_anything(library, tmp_
         (["--name", "a", "--voxel-size", "2"], "settings: voxel_size must lie in [0.001, 0.05] m, got 2.0"),
         (["--name", "a", "--set", "nothing=1"], "--set nothing=1: expected one of voxel_size"),
         (["--name", "a", "--topic", "/x"], "expected a topic /x of type sensor_msgs/msg/Image"),
-        (["--name", "a"], "3 things stand in the workspace"),
+        (["--name", "a"], "or the place of the one to learn (at_x, at_y; --at X Y)"),
+        (["--name", "a", "--at", "nan", "0.1"], "--at: expected two numbers, metres in the table frame, got nan 0.1"),
+        (["--name", "a", "--at", "0.1"], "--at"),
+        (
+            ["--name", "a", "--at", "0.7", "0"],
+            "settings: at_x must lie in the workspace (workspace_x, workspace_width)",
+        ),
+        (["--name", "a", "--set", "at_x=0.1"], "settings: at_x is given without at_y: expected both, or neither"),
+        (["--name", "a", "--at", "0.3", "-0.3"], "nothing stands within 50 mm of the place x 0.30 y -0.30 m"),
     ],
 )
 def test_learn_says_in_one_line_what_is_wrong(tmp_path, options, message):

@@ -4,10 +4,13 @@
 
 import errno
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bayes3d_ros.cli.lines import frame_line
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.io.results import ResultsError, ResultsWriter, scene_record
 from bayes3d_ros.posterior.summarise import posterior_rows
 
@@ -18,7 +21,7 @@ KEYS = [
 ]  # fmt: skip
 OBJECT_KEYS = [
     "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes", "explained", "size", "size_sigma",
+    "face_probabilities", "modes", "explained", "size", "size_sigma", "table_position",
 ]  # fmt: skip
 
 
@@ -54,6 +57,21 @@ def test_a_line_a_frame(written):
                 assert list(mode) == ["weight", "position", "orientation", "covariance", "contact_face"]
                 assert mode["weight"] == pytest.approx(other.weight)
                 np.testing.assert_allclose(mode["covariance"], other.covariance, rtol=1e-9)
+
+
+def test_the_position_on_the_table_is_the_position_in_the_tables_frame(depth_frame, fake_posterior):
+    T = look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3))  # T_table_camera
+    posterior = replace(fake_posterior(depth_frame(), (*TYPES, "unknown"), 4), T_camera_table=np.linalg.inv(T))
+    line = scene_record(posterior)
+    assert [entry["type"] for entry in line["objects"]] == [*TYPES, "unknown"]
+    for entry in line["objects"]:
+        placed = np.array(line["T_camera_table"]) @ [*entry["table_position"], 1.0]
+        np.testing.assert_allclose(placed[:3], entry["position"], atol=1e-8)
+    x, y, _ = line["objects"][3]["table_position"]
+    assert frame_line(posterior).endswith(f"unknown p(exists) 0.86 p(type) 1.00 at x {x:.3f} y {y:.3f} m on the table")
+    assert frame_line(posterior).count("on the table") == 1
+    no_table = scene_record(replace(posterior, T_camera_table=np.full((4, 4), np.nan)))
+    assert no_table["objects"][0]["table_position"] == [None] * 3
 
 
 def test_samples_are_the_posterior_rows_of_all_frames(written):

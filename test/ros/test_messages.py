@@ -208,6 +208,8 @@ def test_the_summary_says_what_a_person_asks(library) -> None:
     assert message.status[0].level == DiagnosticStatus.OK and "unexplained" not in values
     values = {v.key: v.value for v in message.status[1].values}
     assert values["p face"] == "5: 1.000" and values["p mode"] == "1: 1.000" and "mode 1" not in values
+    place = [float(v) for v in values["table position m"].split()]
+    np.testing.assert_allclose(place, posterior.table_position(posterior.objects[0]), atol=1e-4)
     assert "brick: 1.000" in values["p type"] and len(values["sigma position mm"].split()) == 3
 
 

@@ -154,9 +154,39 @@ def test_refusals_are_one_line_each(ros, rig: Rig, frames) -> None:
     assert rig.process.stop() == 0, rig.process.output()
 
 
+def test_one_view_of_the_thing_at_a_place_among_others(ros, rig: Rig) -> None:
+    """A mustard bottle, a cracker box and a drill; the camera sees all three."""
+    rig.show(next(iter(read_frames(share_directory() / "bags" / "unknown_object"))))
+    answer = rig.call("capture")
+    assert not answer.success and "(at_x, at_y; --at X Y)" in answer.message
+    rig.set_parameter("at_x", 0.22)
+    answer = rig.call("capture")
+    assert not answer.success
+    assert answer.message == "parameter at_x is given without at_y: expected both, or neither"
+    rig.set_parameter("at_y", -0.3)
+    answer = rig.call("capture")
+    far = (
+        "nothing stands within 50 mm of the place x 0.22 y -0.30 m (at_x, at_y; --at); 3 things stand in the workspace"
+    )
+    assert not answer.success and answer.message.startswith(far) and "\n" not in answer.message
+    assert not list(rig.library.rglob("*.npz"))
+    rig.set_parameter("at_y", 0.14)
+    ready = "ready to capture the thing at x 0.220 y 0.140 m"
+    ros.wait_for_diagnosis(rig.diagnostics, ready, LEARNER)
+    answer = rig.call("capture")
+    assert answer.success and ", 2 other things left out" in answer.message, answer.message
+    answer = rig.call("build")
+    assert answer.success and ": 1 view, " in answer.message, answer.message
+    assert "learned from one view: the side that it hides is unknown" in answer.message
+    (model,) = load_library(rig.library).models
+    assert model.box_size[2] == pytest.approx(0.21, abs=0.02)  # the cracker box
+    assert rig.process.stop() == 0, rig.process.output()
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
+        ({"at_x": 0.9, "at_y": 0.0}, "parameter at_x must lie in the workspace (workspace_x, workspace_width)"),
         ({"object_name": "../up"}, "parameter object_name: expected letters, digits, '_' and '-', got '../up'"),
         ({"object_name": "''"}, "parameter object_name is not set: expected what to call the object"),
         ({"library": "''"}, "parameter library is not set: expected a folder for object models"),
