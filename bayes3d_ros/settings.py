@@ -111,8 +111,19 @@ class ParserSettings:
         low=0.0,
         high=0.05,
     )
+    object_lean: float = setting(
+        0.015,
+        "standard deviation by which an object leans against how its model rests, in either direction",
+        unit="rad",
+        low=0.0,
+        high=0.3,
+    )
     bad_share: float = setting(
-        0.15, "share of an object's surface that is dented, worn or badly seen, up to 2 cm nearer", low=0.0, high=0.9
+        0.04,
+        "how often a spot (15 mm) of an object's surface is dented, worn or badly seen, by up to 2 cm towards the "
+        "camera; one dent covers several spots, which the model counts one by one",
+        low=0.0,
+        high=0.9,
     )
     edge_share: float = setting(
         0.1, "share of returns at the edges of surfaces that lie anywhere between them", low=0.0, high=0.9
@@ -172,7 +183,7 @@ class ParserSettings:
     @property
     def shares_errors(self) -> bool:
         """Whether neighbouring pixels share errors: with every amplitude zero, `depth` is `independent`."""
-        surface = (self.surface_bias, self.surface_waves, self.model_error, self.bad_share)
+        surface = (self.surface_bias, self.surface_waves, self.model_error, self.object_lean, self.bad_share)
         amplitudes = (*surface, self.edge_share, self.edge_blur)
         return self.likelihood == "depth" and any(amplitudes)
 

@@ -8,21 +8,26 @@ image, a square of a few pixels:
     z = d + phi . a_object + b_cell + e,    e ~ p_out a(z) + (1 - p_out) N(0, sigma_i^2 / |r|^2).
 
 b ~ N(0, tau^2) is the error of a cell: of the table's surface as the camera sees it, or of an object's model. With
-probability pi an object's cell is bad (dents, wear, bled edges): then b ~ U(-`BAD_DEPTH`, 0), towards the camera, since
-cameras do not see through solids. a_object ~ N(0, diag(bias^2 + wave^2, (wave / length)^2, (wave / length)^2)) is a
-depth error that the whole object shares, with phi = (1, x, y), metres from the middle of what is seen of it.
+probability pi an object's cell is bad (dents, wear, bled edges). Half of the bad ones are off as a whole,
+b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras do not see through solids. The other half are planes of their
+own, as blocks of unknown things are (`own_plane.py`), whose median residual is between -`BAD_DEPTH` and
+`SEEN_THROUGH`: dents have slopes. a_object ~ N(0, diag(bias^2 + wave^2, (wave / length)^2, (wave / length)^2)) is a
+depth error that the whole object shares, with phi = (1, x, y), metres from the middle of what is seen of it; the
+variance of its slopes also holds lean^2, as nothing stands upright to the degree.
 
 A pixel whose window shows several surfaces is an edge, and belongs to no cell: the mixture of `density.py`, with each
 point as wide as its surface's errors make it and as likely as a blur of the image says (outlines of depth images are
-off by a part of a pixel, and alike along an object), and with a share for returns between the window's front and back.
+off by a part of a pixel, and alike along an object), with a share for returns between the window's front and back, and,
+with probability pi, of the `BAD_DEPTH` in front of an object.
 
-Within two pixels of an outline a return may also lie anywhere (density `LOST_SHARE` edge_share / `LOST_DEPTH`): cameras
-blur outlines, and lose thin parts. Nothing else excuses a return that is seen through an object.
+Within two pixels of an outline a return may also lie anywhere (density `LOST_SHARE` edge_share / `LOST_DEPTH`; beyond
+the workspace: probability `LOST_SHARE` edge_share): cameras blur outlines, and lose thin parts. Nothing else excuses a
+return that is seen through an object.
 
 A return that stands by more than a margin in front of the scene, and of any object in its window, belongs to something
-unknown (`unknown_depth.py`). Outlines of unknown things have the prior exp(-`OUTLINE_NATS` L), L their length in
-pixels' sides, and another `SEAM_NATS` for each side at which depth goes on from the unknown thing to a known one:
-things end where depth jumps.
+unknown (`own_plane.py`); so does one beside it at which its depth goes on, behind an object of its window. Outlines of
+unknown things have the prior exp(-`OUTLINE_NATS` L), L their length in pixels' sides, and another `SEAM_NATS` for each
+side at which depth goes on from the unknown thing to returns of a known one: things end where depth jumps.
 
 sigma, p_out, the table's tau and a scale of all amplitudes of objects are integrated over nodes (`ErrorNodes`), jointly
 with the scene. Blocks depend on the image alone.
@@ -34,11 +39,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.likelihood.unknown_depth import unknown_log_density
 
 # These change the posterior.
 BAD_DEPTH = 0.02  # metres towards the camera
+SEEN_THROUGH = 0.01  # metres behind an object's surface: returns that are farther are never excused as its own
 OUTLINE_NATS = 1.3  # outlines of length L are some e^(0.97 L): with less the prior has no sum
 SEAM_NATS = 5.0  # a side
 SEAM_DEPTH = 0.01  # metres between neighbouring returns over which depth goes on
@@ -52,7 +58,7 @@ LEAST_BLOCK = 2  # pixels
 BAD_SPREAD = (0.35, 1.0, 2.5)
 BAD_WEIGHT = (0.3, 0.5, 0.2)
 # How a cell's modes, and an object's shared error, are followed
-MODE_STEPS, REWEIGHTED_STEPS = 5, 3
+MODE_STEPS, MORE_MODE_STEPS, REWEIGHTED_STEPS = 5, 2, 3  # more: at the other pairs of noise
 FEWEST_INLIERS = 0.5  # returns, of a mode
 SAME_MODE_SDS = 0.5  # standard deviations within which two modes are one
 # Scales of all amplitudes of objects: log normal, at the nodes of Gauss and Hermite.
@@ -72,6 +78,7 @@ class Amplitudes(NamedTuple):
     bad_share: Float[Array, ""] | np.float32  # of an object's cells
     edge_share: Float[Array, ""] | np.float32  # of returns at edges between the surfaces
     edge_blur: Float[Array, ""] | np.float32  # pixels
+    lean: Float[Array, ""] | np.float32  # metres a metre, of an object against how its model rests
     unknown: Array | np.bool_ = np.True_  # whether there are unknown things; else what stands in front is an outlier
 
 
@@ -93,7 +100,7 @@ class SharedErrorImage(NamedTuple):
     amplitudes: Amplitudes
     block: Int[np.ndarray, ""] | np.int32  # pixels a side
     spread: Float[np.ndarray, "H W"]  # sigma of a return in units of the node's
-    unknown: Float[np.ndarray, "S H W"]  # log density of a return of something unknown, per metre
+    own_plane: Float[np.ndarray, "S H W"]  # log density per metre of a return whose block is a plane of its own
     table_margin: Float[np.ndarray, "H W"]  # metres
 
 
@@ -107,9 +114,9 @@ def shared_error_image(image: ScoredImage, amplitudes: Amplitudes, sigma_max: fl
     nodes = _nodes(image, spread, inside, block, amplitudes, sigma_max)
     margin = np.maximum(TABLE_MARGIN, TABLE_MARGIN_SDS * nodes.sigma.max() * spread)
     bare = np.asarray(image.bare_depth)
-    standing = inside & (depth < bare - margin) & bool(amplitudes.unknown)
-    unknown = unknown_log_density(image, standing, spread, block, nodes.sigma, nodes.p_outlier)
-    return SharedErrorImage(nodes, amplitudes, np.int32(block), spread, unknown, margin.astype(np.float32))
+    standing = inside & (depth < bare - margin)
+    own_plane = own_plane_log_density(image, standing, spread, block, nodes.sigma, nodes.p_outlier)
+    return SharedErrorImage(nodes, amplitudes, np.int32(block), spread, own_plane, margin.astype(np.float32))
 
 
 def _nodes(image, spread, inside, block: int, amplitudes: Amplitudes, sigma_max: float) -> ErrorNodes:

@@ -20,11 +20,13 @@ from bayes3d_ros.likelihood.shared_errors import (
     LOST_DEPTH,
     LOST_SHARE,
     MODE_STEPS,
+    MORE_MODE_STEPS,
     OUTLINE_NATS,
     REWEIGHTED_STEPS,
     SAME_MODE_SDS,
     SEAM_DEPTH,
     SEAM_NATS,
+    SEEN_THROUGH,
     STEEPEST,
     SharedErrorImage,
 )
@@ -46,11 +48,13 @@ class CellModes(NamedTuple):
         apart = (self.place - mean) ** 2 * self.curvature / spread
         return np.logaddexp(np.logaddexp.reduce(self.height - 0.5 * np.log(spread) - 0.5 * apart), self.outliers)
 
-    def bad(self) -> Float[np.ndarray, "C"]:
-        """The same over b uniform in the `BAD_DEPTH` towards the camera."""
+    def bad(self, own_plane: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+        """log of the mean of the integral over b uniform in the `BAD_DEPTH` towards the camera, and of what planes of
+        the cells' own say."""
         within = (self.place < 0) & (self.place > -BAD_DEPTH)
         width = 0.5 * np.log(2 * np.pi / np.maximum(self.curvature, 1e-12)) - np.log(BAD_DEPTH)
-        return np.logaddexp(np.logaddexp.reduce(np.where(within, self.height + width, -np.inf)), self.outliers)
+        offset = np.logaddexp.reduce(np.where(within, self.height + width, -np.inf))
+        return np.logaddexp(np.logaddexp(offset, own_plane) - np.log(2), self.outliers)
 
 
 class SurfaceCells(NamedTuple):
@@ -63,15 +67,27 @@ class SurfaceCells(NamedTuple):
     real: Bool[np.ndarray, "C K"]
     label: Int[np.ndarray, "C"]
     middle: Float[np.ndarray, "C 2"]  # column and row
+    own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own, -inf where it may have none
 
 
-def modes(cells: SurfaceCells, sigma: float, p: float) -> CellModes:
-    """From offset 0, and from the median residual, by expectation and maximisation."""
+def modes_at_nodes(cells: SurfaceCells, errors: SharedErrorImage) -> list[CellModes]:
+    """At every pair of noise, each from the last one's."""
+    found: list[CellModes] = []
+    for sigma, p in zip(errors.nodes.sigma.astype(float), errors.nodes.p_outlier.astype(float), strict=True):
+        found.append(modes(cells, sigma, p, found[-1].place if found else None))
+    return found
+
+
+def modes(cells: SurfaceCells, sigma: float, p: float, starts: Float[np.ndarray, "2 C"] | None = None) -> CellModes:
+    """By expectation and maximisation from these places, or from offset 0, and from the median residual."""
     if not len(cells.residual):
         none = np.zeros((2, 0))
         return CellModes(none, none, none, np.zeros(0))
-    starts = (np.zeros(len(cells.residual)), np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1))
-    found = [_follow(cells, start, sigma, p) for start in starts]
+    steps = MODE_STEPS if starts is None else MORE_MODE_STEPS
+    if starts is None:
+        median = np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1)
+        starts = np.stack([np.zeros(len(cells.residual)), median])
+    found = [_follow(cells, start, sigma, p, steps) for start in starts]
     height, place, curvature, inliers = (np.stack(a) for a in zip(*found, strict=True))
     height = np.where(inliers > FEWEST_INLIERS, height, -np.inf)
     same = np.abs(place[0] - place[1]) * np.sqrt(curvature.min(0)) < SAME_MODE_SDS
@@ -80,14 +96,14 @@ def modes(cells: SurfaceCells, sigma: float, p: float) -> CellModes:
     return CellModes(height, place, curvature, outliers)
 
 
-def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: float):
+def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: float, steps: int):
     def parts(b):
         inlier = np.exp(-0.5 * (cells.residual - b[:, None]) ** 2 * cells.precision / sigma**2)
         inlier = (1 - p) * inlier * np.sqrt(cells.precision / (2 * np.pi)) / sigma
         total = p * cells.outlier + cells.lost + inlier
         return np.where(cells.real, inlier / total, 0), np.where(cells.real, np.log(np.where(cells.real, total, 1)), 0)
 
-    for _ in range(MODE_STEPS):
+    for _ in range(steps):
         share, _ = parts(b)
         weight = share * cells.precision
         b = np.where(share.sum(1) > 1e-6, (weight * cells.residual).sum(1) / np.maximum(weight.sum(1), 1e-12), b)
@@ -103,6 +119,7 @@ class _Pixels(NamedTuple):
     cell: Bool[np.ndarray, "H W"]
     near_outline: Bool[np.ndarray, "H W"]
     hidden: Bool[np.ndarray, "H W"]  # saw beyond the workspace, through a surface
+    of_object: Bool[np.ndarray, "H W"]  # as far as an object in their window is
 
 
 def kinds_of_pixels(
@@ -112,7 +129,10 @@ def kinds_of_pixels(
     observed, pixel_class = np.asarray(image.depth, np.float64), np.asarray(image.pixel_class)
     rows = np.arange(len(observed))[:, None] < image.own_rows
     inside = (pixel_class == IN_WORKSPACE) & rows
+    of_object = inside & near_object(observed, depth, label, errors.table_margin)
     unknown = inside & stands_in_front(observed, depth, label, errors.table_margin)
+    behind = observed < depth - errors.table_margin - np.where(label >= OBJECT, BAD_DEPTH, 0)
+    unknown |= inside & behind & ~of_object & _goes_on(unknown, observed)
     several = label == NOTHING
     for dv, du in _around():
         z, there = _shifted(depth, dv, du, np.inf), _shifted(label, dv, du, NOTHING)
@@ -123,7 +143,31 @@ def kinds_of_pixels(
     scored = inside & ~unknown
     hidden = (pixel_class == BEYOND) & rows & (depth < observed + float(image.front_margin))
     near = ndimage.binary_dilation(several & rows, np.ones((3, 3)))
-    return _Pixels(unknown, scored & several, scored & ~several, near, hidden)
+    return _Pixels(unknown, scored & several, scored & ~several, near, hidden, of_object)
+
+
+def near_object(
+    observed: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    margin: Float[np.ndarray, "H W"],
+) -> Bool[np.ndarray, "H W"]:
+    """Returns that are within `BAD_DEPTH` and a margin, metres, of an object in their window."""
+    near = np.zeros(depth.shape, bool)
+    for dv, du in _around():
+        of_object = _shifted(label, dv, du, NOTHING) >= OBJECT
+        z = np.where(of_object, _shifted(depth, dv, du, np.inf), np.inf)
+        near |= np.abs(observed - z) < margin + BAD_DEPTH
+    return near
+
+
+def _goes_on(which: Bool[np.ndarray, "H W"], observed: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels with one of these above, below, left or right of them, at nearly the same depth."""
+    found = np.zeros(which.shape, bool)
+    for dv, du in ((-1, 0), (0, -1), (0, 1), (1, 0)):
+        apart = np.abs(_shifted(observed, dv, du, np.inf) - observed)
+        found |= _shifted(which, dv, du, False) & (apart < SEAM_DEPTH)
+    return found
 
 
 def stands_in_front(
@@ -178,14 +222,19 @@ def cells_of(
     real = spread(np.ones(len(v))) > 0
     count = np.maximum(real.sum(1), 1)
     middle = np.stack([spread(u).sum(1) / count, spread(v).sum(1) / count], 1)
+    residual = spread(observed - depth[v, u], np.nan)
+    median = np.nanmedian(residual, 1) if len(residual) else np.zeros(0)
+    near = (median > -BAD_DEPTH) & (median < SEEN_THROUGH)
+    own_plane = np.stack([spread(values).sum(1) for values in errors.own_plane[:, v, u].astype(np.float64)], 1)
     return SurfaceCells(
-        spread(observed - depth[v, u]),
+        np.nan_to_num(residual),
         spread(rays / errors.spread[v, u].astype(np.float64) ** 2, 1.0),
         spread(float(image.outlier_scale) * observed**2, 1.0),
         spread(np.where(kinds.near_outline[v, u], lost_density(errors), 0.0)),
         real,
         label[v, u][first],
         middle,
+        np.where(near[:, None], own_plane, -np.inf),
     )
 
 
@@ -219,8 +268,8 @@ def log_edges(
         variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
         off = observed - y0 * (1 + (ex * a + ey * b) / norm2)
         inlier = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
-        window.append((apart, across, inlier, np.where(surface, y0, np.nan)))
-    apart, across, inlier, points = (np.array(part) for part in zip(*window, strict=True))
+        window.append((apart, across, inlier, np.where(surface, y0, np.nan), there >= OBJECT))
+    apart, across, inlier, points, of_objects = (np.array(part) for part in zip(*window, strict=True))
     any_surface = np.isfinite(points).any(0)
     nearest = np.where(any_surface, across.min(0), 0)
     blur = float(amplitudes.edge_blur)
@@ -232,9 +281,21 @@ def log_edges(
     front = np.nanmin(np.where(any_surface, points, 0.0), 0)
     back = np.maximum(np.nanmax(np.where(any_surface, points, 0.0), 0), front + 4 * noise)
     between = np.where((observed > front) & (observed < back), 1 / (back - front), 0.0)
-    share = float(amplitudes.edge_share)
+    dented = of_objects.any(0) & (observed < front) & (observed > front - BAD_DEPTH)
+    share, bad_share = float(amplitudes.edge_share), float(amplitudes.bad_share) * of_objects.any(0)
+    mixture = (1 - bad_share) * mixture + bad_share * dented / BAD_DEPTH
     inside = np.where(any_surface, (1 - share) * mixture + share * between, outlier)
     return np.log(p * outlier + np.where(any_surface, lost_density(errors), 0.0) + (1 - p) * inside)
+
+
+def log_unknown(
+    unknown: Bool[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage, node: int
+) -> Float[np.ndarray, "E"]:
+    """log density of each return that stands in front of the scene: of something unknown, where there may be any."""
+    if errors.amplitudes.unknown:
+        return errors.own_plane[node][unknown].astype(np.float64)
+    outlier = float(image.outlier_scale) * np.asarray(image.depth, np.float64)[unknown] ** 2
+    return np.log(float(errors.nodes.p_outlier[node]) * outlier)
 
 
 def lost_density(errors: SharedErrorImage) -> float:
@@ -242,27 +303,28 @@ def lost_density(errors: SharedErrorImage) -> float:
     return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH
 
 
-def mask_nats(unknown: Bool[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage) -> float:
-    """Of the outlines of what is unknown: prior's nats, negative."""
+def mask_nats(unknown: Bool[np.ndarray, "H W"], of_object: Bool[np.ndarray, "H W"], image: ScoredImage) -> float:
+    """Of the outlines of what is unknown: prior's nats, negative. of_object: returns that depth should not go on to."""
     observed = np.asarray(image.depth, np.float64)
     inside = (np.asarray(image.pixel_class) == IN_WORKSPACE) & (np.arange(len(observed))[:, None] < image.own_rows)
     total = 0.0
     for axis in (0, 1):
         one, other = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         sides = inside[one] & inside[other] & (unknown[one] != unknown[other])
-        known = np.where(unknown[one], label[other], label[one])
-        seam = sides & (known >= OBJECT) & (np.abs(observed[one] - observed[other]) < SEAM_DEPTH)
+        known = np.where(unknown[one], of_object[other], of_object[one])
+        seam = sides & known & (np.abs(observed[one] - observed[other]) < SEAM_DEPTH)
         total -= OUTLINE_NATS * sides.sum() + SEAM_NATS * seam.sum()
     return total
 
 
-def log_object(cells: SurfaceCells, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float) -> float:
+def log_object(
+    cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
+) -> float:
     """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
-    three reweighted steps."""
+    three reweighted steps. found: the cells' modes at the node."""
     amplitudes = errors.amplitudes
-    found = modes(cells, float(errors.nodes.sigma[node]), float(errors.nodes.p_outlier[node]))
     share, model = float(amplitudes.bad_share), scale * float(amplitudes.model)
-    bad = found.bad()
+    bad = found.bad(cells.own_plane[:, node])
 
     def log_cells(a, share, sd=model):
         mean = phi @ a
@@ -276,9 +338,10 @@ def log_object(cells: SurfaceCells, node: int, scale: float, errors: SharedError
     middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
     phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
     bias2, wave2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.wave)) ** 2
-    if bias2 + wave2 == 0:
+    slope2 = wave2 / float(amplitudes.length) ** 2 + (scale * float(amplitudes.lean)) ** 2
+    if bias2 + slope2 == 0:
         return log_all(np.zeros(3))
-    prior = np.array([bias2 + wave2, wave2 / float(amplitudes.length) ** 2, wave2 / float(amplitudes.length) ** 2])
+    prior = np.array([bias2 + wave2, slope2, slope2])
     prior = np.maximum(prior, 1e-12)
     a = np.zeros(3)
     for step in range(REWEIGHTED_STEPS):
@@ -316,21 +379,24 @@ def log_density(
     depth = np.asarray(depth, np.float64)
     kinds = kinds_of_pixels(depth, label, image, errors)
     cells = cells_of(depth, label, kinds, image, errors)
-    nodes = errors.nodes
-    mask = mask_nats(kinds.unknown, label, image) if errors.amplitudes.unknown else 0.0
+    nodes, lost = errors.nodes, LOST_SHARE * float(errors.amplitudes.edge_share)
+    mask = mask_nats(kinds.unknown, kinds.of_object, image) if errors.amplitudes.unknown else 0.0
     found = np.zeros((len(nodes.sigma), len(nodes.table), len(nodes.scale)))
-    table = _take(cells, cells.label == TABLE)
-    for s, (sigma, p) in enumerate(zip(nodes.sigma.astype(float), nodes.p_outlier.astype(float), strict=True)):
-        fixed = mask + errors.unknown[s][kinds.unknown].sum(dtype=np.float64) + kinds.hidden.sum() * np.log(p)
+    table = modes_at_nodes(_take(cells, cells.label == TABLE), errors)
+    objects = {}
+    for k in np.unique(cells.label[cells.label >= OBJECT]):
+        own = _take(cells, cells.label == k)
+        metres = depth[kinds.cell & (label == k)].mean() / float(image.focal[0])
+        objects[k] = own, modes_at_nodes(own, errors), metres
+    for s in range(len(nodes.sigma)):
+        fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
+        fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
         fixed += log_edges(depth, label, kinds.edge, image, errors, s).sum()
-        of_table = modes(table, sigma, p)
         for t, sd in enumerate(nodes.table.astype(float)):
-            found[s, t] += fixed + of_table.normal(0.0, sd).sum()
-        for k in np.unique(cells.label[cells.label >= OBJECT]):
-            own = _take(cells, cells.label == k)
-            metres = depth[kinds.cell & (label == k)].mean() / float(image.focal[0])
+            found[s, t] += fixed + table[s].normal(0.0, sd).sum()
+        for own, at_nodes, metres in objects.values():
             for a, scale in enumerate(nodes.scale.astype(float)):
-                found[s, :, a] += log_object(own, s, scale, errors, metres)
+                found[s, :, a] += log_object(own, at_nodes[s], s, scale, errors, metres)
     return found.reshape(len(nodes.sigma), -1)
 
 

@@ -59,6 +59,12 @@ def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     return scale / jnp.maximum(excess, 1)[:, None, None]
 
 
+def widened(modes: Hypotheses) -> Hypotheses:
+    """Modes that another likelihood has elsewhere, by some `shared_spread`."""
+    covariance = modes.scale @ modes.scale.swapaxes(1, 2) + jnp.diag(jnp.array(SEARCH.shared_spread) ** 2)
+    return modes._replace(scale=factor(covariance))
+
+
 def _draw_about(placement: Placement, offset: Float[Array, "M D 3"]) -> Placement:
     """Hypotheses [M, D] at offsets in (x, y, yaw) from each mode."""
     count = offset.shape[1]

@@ -118,6 +118,7 @@ def amplitudes_of(settings: ParserSettings) -> Amplitudes:
         settings.bad_share,
         settings.edge_share,
         settings.edge_blur,
+        settings.object_lean,
     )
-    bias, waves, length, model, bad, edge, blur = map(np.float32, known)
-    return Amplitudes(bias, waves, length, model, bad, edge, blur, np.bool_(settings.unknown))
+    bias, waves, length, model, bad, edge, blur, lean = map(np.float32, known)
+    return Amplitudes(bias, waves, length, model, bad, edge, blur, lean, np.bool_(settings.unknown))

@@ -2,7 +2,7 @@
 
 """Changes the posterior: constants of the model, beside the settings, that a frame is parsed with.
 
-The likelihood's own stand in `likelihood/density.py`, `likelihood/shared_errors.py` and `likelihood/unknown_depth.py`.
+The likelihood's own stand in `likelihood/density.py`, `likelihood/shared_errors.py` and `likelihood/own_plane.py`.
 """
 
 import math

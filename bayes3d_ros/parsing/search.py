@@ -37,6 +37,7 @@ from bayes3d_ros.parsing.mode_search import (
     narrow,
     sharpen,
     take,
+    widened,
     with_self_symmetry,
 )
 from bayes3d_ros.parsing.neighbour_depth import neighbour_depth
@@ -253,21 +254,26 @@ def _searched(
 ) -> tuple[Modes, Pilots]:
     """A mixture about the modes that are uphill of what was found, and the pilots that it was fitted to."""
     _, library, table = context
-    early_key, narrow_key, sharpen_key, adapt_key = jax.random.split(key, 4)
+    early_key, narrow_key, sharpen_key, adapt_key, model_key = jax.random.split(key, 5)
     # A pose that is right but for a centimetre may gain less than a wrong one that was aligned well: each is followed a
     # little before most are dropped.
     modes, value = narrow(early_key, found, rough, SEARCH.early_draws, SEARCH.early_rounds)
     modes, value = best_first(modes, value, len(value))
     modes = _types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
-    modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
-    if not isinstance(model, NoiseGrid):
-        # Against something unknown a wrong object may lose what it gains over the table: the model itself chooses.
-        value = _marginal_gains(model, scene.loglik_grid, scene, context, window)(modes.placement)
+    if isinstance(model, NoiseGrid):
+        modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
+    else:
+        # Against something unknown a wrong object may lose what it gains over the table, and a right one is a few
+        # millimetres off where pixels alone have it: the model itself follows the modes, and chooses.
+        modes, _ = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.shared_rough_rounds)
+        itself = _marginal_gains(model, scene.loglik_grid, scene, context, window)
+        modes, value = narrow(model_key, widened(modes), itself, SEARCH.shared_draws, SEARCH.shared_rounds)
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
     modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
     exact, marginal = _targets(take(modes.placement, slice(1)), scene, context, model, window)
-    modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, SEARCH.fit_rounds)
+    rounds = SEARCH.fit_rounds if isinstance(model, NoiseGrid) else SEARCH.shared_fit_rounds
+    modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, rounds)
     mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
     return with_self_symmetry(mixture, exact, library), pilots
 
@@ -275,17 +281,18 @@ def _searched(
 def _targets(
     first: Placement, scene: LeadScene, context: Context, model: ImageModel, window: int
 ) -> tuple[Gains, Gains]:
-    """What modes are fitted to, at one noise level, and what the sampler's weights will hold: the errors' parameters
-    integrated out. Modes that explain different parts of the image are compared by thousands of nats; at one noise
-    level that comparison is off by ten. first [1]: an object that explains what there is to explain."""
+    """What modes are fitted to (where pixels err alone: at one noise level), and what the sampler's weights will hold:
+    the errors' parameters integrated out. Modes that explain different parts of the image are compared by thousands of
+    nats; at one noise level that comparison is off by ten. first [1]: what explains what there is to explain."""
+    if not isinstance(model, NoiseGrid):
+        both = _marginal_gains(model, scene.loglik_grid, scene, context, window)
+        return both, both
     grid_then = (
         scene.loglik_grid + gain(model, first, jnp.zeros(1, jnp.int32), scene.depth[None], context, window)[0][0]
     )
     noise = likeliest_noise(model, grid_then)
-    part, rows = model, jnp.arange(len(scene.loglik_grid))
-    if isinstance(model, NoiseGrid):
-        part = near_peak(grid_then, model)
-        rows = jnp.searchsorted(model.coarse.sigma, part.coarse.sigma)
+    part = near_peak(grid_then, model)
+    rows = jnp.searchsorted(model.coarse.sigma, part.coarse.sigma)
 
     def exact(placement: Placement) -> Float[Array, "N"]:
         return _gains(placement, scene.depth, context, noise, window)

@@ -60,6 +60,13 @@ class SearchTuning(NamedTuple):
     # Modes and the mixture (`mode_search.py`, `proposal.py`)
     narrow_draws: int = 20  # a mode and round; not recorded
     narrow_rounds: int = 4  # not recorded
+    # Of errors that pixels share: rounds in which pixels alone are scored, then draws and rounds of the model itself,
+    # from modes that are wider by metres, metres, radians. Real clutter: modes of pixels alone are 5 mm off there.
+    shared_rough_rounds: int = 1
+    shared_draws: int = 16
+    shared_rounds: int = 4
+    shared_spread: tuple[float, float, float] = (0.003, 0.003, 0.04)
+    shared_fit_rounds: int = 2  # as `fit_rounds`
     fit_draws: int = 24  # a mode and round, of the paraboloid; not recorded
     fit_rounds: int = 5  # not recorded
     finalists: int = 10  # modes of the mixture; slivers

@@ -106,7 +106,7 @@ def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownTh
     node = len(errors.nodes.sigma) // 2
     height, width = mask.shape
     outlier = float(np.asarray(seen.image.outlier_scale)) * np.maximum(seen.depth, 1e-6) ** 2
-    gain = errors.unknown[node, :height, :width] - np.log(float(errors.nodes.p_outlier[node]) * outlier)
+    gain = errors.own_plane[node, :height, :width] - np.log(float(errors.nodes.p_outlier[node]) * outlier)
     T = seen.T_camera_table
     points = (unproject(np.where(mask, seen.depth, np.nan), seen.camera) - T[:3, 3]) @ T[:3, :3]
     regions, count = _regions(mask, seen.depth, seen.pixel_class != NO_RETURN, points)

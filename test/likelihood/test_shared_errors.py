@@ -13,10 +13,10 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood import slow_shared_errors as slow
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.likelihood.image_model import gain, log_marginal, shared_errors
+from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import scored_image
 from bayes3d_ros.likelihood.shared_errors import Amplitudes, shared_error_image
-from bayes3d_ros.likelihood.unknown_depth import unknown_log_density
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
@@ -24,20 +24,27 @@ from bayes3d_ros.objects.placement import Placement, Table
 
 trimesh = pytest.importorskip("trimesh")
 SIGMA, P, OUTLIER = 0.001, 0.005, 0.015
-SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.0005, 0.05, 0.001, 0.15, 0.1, 0.7)))
-NONE = Amplitudes(*map(np.float32, (0, 0, 0.05, 0, 0, 0, 0)), np.False_)
+SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.0005, 0.05, 0.001, 0.15, 0.1, 0.7, 0.015)))
+NONE = Amplitudes(*map(np.float32, (0, 0, 0.05, 0, 0, 0, 0, 0)), np.False_)
 CAMERA = Intrinsics(120.0, 120.0, 47.5, 35.5, 96, 72)
 NEAR, FAR, SIGMA_MAX, WINDOW = 0.1, 5.0, 0.005, 3
 
 
 def cells(residuals, lost=0.0):
-    """One cell a row of residuals, metres."""
+    """One cell a row of residuals, metres; none is a plane of its own."""
     residual = np.atleast_2d(np.asarray(residuals, float))
     whole = np.ones(residual.shape)
     k = np.arange(len(residual))
     middle = 3.0 * np.stack([k % 6, k // 6], 1)
     label = np.full(len(residual), slow.OBJECT)
-    return slow.SurfaceCells(residual, whole, OUTLIER * whole, lost * whole, whole > 0, label, middle)
+    return slow.SurfaceCells(
+        residual, whole, OUTLIER * whole, lost * whole, whole > 0, label, middle, np.full((len(residual), 4), -np.inf)
+    )
+
+
+def _log_object(residuals, errors):
+    found = slow.modes(cells(residuals), SIGMA, P)
+    return slow.log_object(cells(residuals), found, 0, 1.0, errors, 0.005)
 
 
 def by_quadrature(residual, sd, mean=0.0):
@@ -74,7 +81,7 @@ def test_what_is_seen_through_is_not_excused():
     off = np.where(np.arange(30)[:, None] % 7 == 3, 0.015, 0.0)  # four blocks, spread out
 
     def value(sign):
-        return slow.log_object(cells(noise + sign * off), 0, 1.0, errors, 0.005)
+        return _log_object(noise + sign * off, errors)
 
     assert value(0) - value(-1) < 4 * 8
     assert value(0) - value(1) > 4 * 50
@@ -96,7 +103,7 @@ def test_information_saturates():
     def width(count):
         noise = SIGMA * rng.normal(size=(40, count))
         shifts = np.linspace(-0.003, 0.003, 7)
-        values = [slow.log_object(cells(noise + s), 0, 1.0, errors, 0.005) for s in shifts]
+        values = [_log_object(noise + s, errors) for s in shifts]
         return np.sqrt(-1 / (2 * np.polyfit(shifts, values, 2)[0]))
 
     assert width(36) == pytest.approx(width(9), rel=0.1)
@@ -120,7 +127,8 @@ def _bare_image(depth=None, seed=0):
 
 @pytest.fixture(scope="module")
 def scene():
-    """A brick and a tower on a table, one in front of the other, with a bias and a dent."""
+    """A brick and a tower on a table, one in front of the other, with a bias and a dent; unknown things behind and
+    beside."""
     shapes = {"brick": (0.10, 0.06, 0.04), "tower": (0.05, 0.05, 0.14)}
     library = library_arrays(
         Library(tuple(model_from_mesh(trimesh.creation.box(e), n, 0.004) for n, e in shapes.items()))
@@ -139,6 +147,8 @@ def scene():
         truth = np.minimum(truth, depth)
     dented = truth + 0.001 * (labels >= slow.OBJECT)
     dented[30:34, 40:44] -= 0.008
+    dented[8:20, 30:75] = np.minimum(dented[8:20, 30:75], 0.74)  # something unknown behind the tower,
+    dented[36:42, 24:40] = np.minimum(dented[36:42, 24:40], 0.645)  # and beside the brick, where depth goes on
     image, _ = _bare_image(dented, seed=3)
     return image, bare, truth, labels, library, table, objects
 
@@ -161,6 +171,25 @@ def test_the_kernel_adds_up_to_the_reference(scene, amplitudes):
     weight = model.image.nodes.log_weight.astype(float)
     expected = logsumexp(whole + weight) - logsumexp(before + weight)
     assert float(log_marginal(model, total)[0]) - empty == pytest.approx(expected, abs=1.0 if amplitudes.bias else 0.2)
+
+
+def test_gains_do_not_depend_on_what_else_is_scored(scene):
+    """Nor on its order: what the kernel works in is used again, and what it knows of a scene is kept."""
+    image, bare, _, _, library, table, objects = scene
+    model = shared_errors(image, shared_error_image(image, SHIPPED, SIGMA_MAX))
+    context = jax.device_put(image), library, table
+    rng = np.random.default_rng(4)
+    kinds = [jnp.asarray(rng.integers(0, n, 24)) for n in (2, 6)]
+    places = [jnp.asarray(rng.uniform(-w, w, 24), jnp.float32) for w in (0.3, 0.3, 3.0)]
+    many, first = Placement(*kinds, *places), jax.tree.map(lambda a: a[:1], objects)
+    padded = pad_scene(jnp.asarray(bare, jnp.float32)[None], WINDOW)
+    scenes = jnp.concatenate([padded, render_objects(first, padded, *context, WINDOW)])
+    ancestor = jnp.asarray(rng.integers(0, 2, 24), jnp.int32)
+    together, _ = gain(model, many, ancestor, scenes, context, WINDOW)
+    for k in range(24):
+        one = jax.tree.map(lambda a, k=k: a[k : k + 1], many)
+        alone, _ = gain(model, one, ancestor[k : k + 1], scenes, context, WINDOW)
+        assert np.array_equal(alone[0], together[k])
 
 
 def test_without_amplitudes_pixels_are_independent(scene):
@@ -192,7 +221,7 @@ def _cost_a_cm2(surface):
     everywhere, behind = np.full(depth.shape, IN_WORKSPACE), np.full(depth.shape, 2.0)
     image = scored_image(CAMERA, seen, everywhere, behind, NEAR, FAR, SIGMA_MAX)
     sigma, p = np.array([SIGMA]), np.array([P])
-    unknown = unknown_log_density(image, patch, np.ones(depth.shape), 4, sigma, p)[0]
+    unknown = own_plane_log_density(image, patch, np.ones(depth.shape), 4, sigma, p)[0]
     known = -0.5 * ((seen - depth)[patch] / SIGMA) ** 2 - np.log(np.sqrt(2 * np.pi) * SIGMA)
     return (known.sum() - unknown[patch].sum()) / (1e4 * (depth[patch] / CAMERA.fx) ** 2).sum()
 

@@ -15,11 +15,18 @@ from bayes3d_ros.likelihood.cpu.buffers import f32, u64
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, inlined, strict
 from bayes3d_ros.likelihood.cpu.packing import larger
 from bayes3d_ros.likelihood.cpu.windows import exp, log
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, FEWEST_INLIERS, MODE_STEPS, SAME_MODE_SDS
+from bayes3d_ros.likelihood.shared_errors import (
+    BAD_DEPTH,
+    FEWEST_INLIERS,
+    MODE_STEPS,
+    MORE_MODE_STEPS,
+    SAME_MODE_SDS,
+)
 
 CELLS_SIDE_BY_SIDE = 64
 NO_MODE = f32(-1e30)  # stands for -inf
-_LOG_BAD_WIDTH = f32(0.5 * np.log(2 * np.pi) - np.log(BAD_DEPTH))
+_LOG_BAD_WIDTH = f32(0.5 * np.log(2 * np.pi) - np.log(BAD_DEPTH) - np.log(2))  # half of the bad cells
+LOG_HALF = f32(-np.log(2))
 
 
 class Batch(NamedTuple):
@@ -31,11 +38,12 @@ class Batch(NamedTuple):
     outlier: Float[np.ndarray, "K*w"]
     lost: Float[np.ndarray, "K*w"]  # density of a return near an outline that lies anywhere
     label: Int[np.ndarray, "w"]
-    sign: Float[np.ndarray, "w"]  # 1 of the scene with the object, -1 of that without
+    place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a cell is added to
     column: Float[np.ndarray, "w"]  # mean place of its pixels
     row: Float[np.ndarray, "w"]
     number: Float[np.ndarray, "w"]  # of returns
     start: Float[np.ndarray, "w"]  # median residual
+    own_plane: Float[np.ndarray, "S*w"]  # log density with a plane of its own, NO_MODE where it may have none
     place: Float[np.ndarray, "2*w"]
     height: Float[np.ndarray, "2*w"]
     curvature: Float[np.ndarray, "2*w"]
@@ -46,7 +54,7 @@ class Batch(NamedTuple):
 
 
 @allocating
-def new_batch(returns):
+def new_batch(returns, pairs):
     return Batch(
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
@@ -54,11 +62,12 @@ def new_batch(returns):
         np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
+        np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
-        np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
+        np.zeros(pairs * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(2 * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(2 * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(2 * CELLS_SIDE_BY_SIDE, np.float32),
@@ -136,14 +145,14 @@ def _look(batch, returns, at, sigma, p):
 
 
 @strict
-def find_modes(batch, returns, sigma, p):
-    """Both modes of every cell, in place."""
+def find_modes(batch, returns, sigma, p, first):
+    """Both modes of every cell, in place. Of other pairs of noise than the `first` they are near the last one's."""
     w = CELLS_SIDE_BY_SIDE
-    for c in range(w):
+    for c in range(w if first else 0):
         batch.place[c] = f32(0.0)
         batch.place[w + c] = batch.start[c]
     for at in range(0, 2 * w, w):
-        for _ in range(MODE_STEPS):
+        for _ in range(MODE_STEPS if first else MORE_MODE_STEPS):
             _one_step(batch, returns, at, sigma, p)
         _look(batch, returns, at, sigma, p)
     for at in range(0, 2 * w):
@@ -166,25 +175,29 @@ def _good(height, place, curvature, mean, variance):
 
 @inlined
 def bad_mode(height, place, curvature):
-    """The same over an offset that is uniform in the `BAD_DEPTH` towards the camera."""
+    """The same over an offset that is uniform in the `BAD_DEPTH` towards the camera; by the half of bad cells that are
+    so."""
     within = (place < f32(0.0)) & (place > f32(-BAD_DEPTH))
     value = height - f32(0.5) * log(max(curvature, f32(1e-12))) + _LOG_BAD_WIDTH
     return value if within else NO_MODE
 
 
 @fast
-def normal_cells(batch, variance, share):
-    """log likelihood of each cell of the batch with an offset ~ N(0, variance), or, by `share`, a bad one."""
+def normal_cells(batch, s, variance, share):
+    """log likelihood of each cell of the batch at pair of noise s, with an offset ~ N(0, variance), or, by `share`, a
+    bad one."""
     w = u64(CELLS_SIDE_BY_SIDE)
+    own_plane, at = batch.own_plane, u64(s) * w
     height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value
     for c in range(w):
         one = _good(height[c], place[c], curvature[c], f32(0.0), variance)
         other = _good(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
         worse = bad_mode(height[c], place[c], curvature[c])
         worst = bad_mode(height[w + c], place[w + c], curvature[w + c])
-        high = larger(larger(larger(one, other), outliers[c]), larger(worse, worst))
+        free = own_plane[at + c] + LOG_HALF
+        high = larger(larger(larger(one, other), outliers[c]), larger(larger(worse, worst), free))
         total = (f32(1.0) - share) * (exp(one - high) + exp(other - high)) + exp(outliers[c] - high)
-        total += share * (exp(worse - high) + exp(worst - high))
+        total += share * (exp(worse - high) + exp(worst - high) + exp(free - high))
         value[c] = high + log(larger(total, f32(1e-37)))
 
 

@@ -75,7 +75,7 @@ def shared_gain(
         _real(image.bare_depth),
         _real(errors.spread),
         _real(errors.table_margin),
-        _real(errors.unknown),
+        _real(errors.own_plane),
         _real(nodes.sigma),
         _real(nodes.p_outlier),
         _real(nodes.table),

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayes3d_ros.likelihood.cpu.buffers import f32, u64
-from bayes3d_ros.likelihood.cpu.cells import bad_mode
+from bayes3d_ros.likelihood.cpu.cells import LOG_HALF, NO_MODE, bad_mode
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
 from bayes3d_ros.likelihood.cpu.packing import larger
 from bayes3d_ros.likelihood.cpu.windows import exp, log
@@ -68,15 +68,17 @@ def place_cells(cells, count, metres):
 
 
 @fast
-def begin_object(cells, s, most, count):
-    """What bad cells say, at one pair of noise."""
+def begin_object(cells, s, most, count, share):
+    """What bad cells say, at one pair of noise, but for outliers: `cells.bad` holds what planes of their own say."""
     first, at = u64(2 * s * most), u64(s * most)
     second = first + u64(most)
     for c in range(u64(count)):
         one = bad_mode(cells.height[first + c], cells.place[first + c], cells.curvature[first + c])
         other = bad_mode(cells.height[second + c], cells.place[second + c], cells.curvature[second + c])
-        high = larger(one, other)
-        cells.bad[at + c] = high + log(exp(one - high) + exp(other - high))
+        free = cells.bad[at + c] + LOG_HALF
+        high = larger(larger(one, other), free)
+        bad = high + log(exp(one - high) + exp(other - high) + exp(free - high))
+        cells.bad[at + c] = bad if share > f32(0.0) else NO_MODE
 
 
 @strict
@@ -168,9 +170,10 @@ def _log_of_shares(sums):
 def _priors(scale, amplitudes):
     """Variances of an object's bias and slopes; 0 where it has no shared error."""
     bias2, wave2 = (scale * amplitudes[0]) ** 2, (scale * amplitudes[1]) ** 2
-    if bias2 + wave2 == 0:
+    slope2 = wave2 / (amplitudes[2] * amplitudes[2]) + (scale * amplitudes[7]) ** 2
+    if bias2 + slope2 == 0:
         return 0.0, 0.0
-    return max(bias2 + wave2, 1e-12), max(wave2 / (amplitudes[2] * amplitudes[2]), 1e-12)
+    return max(bias2 + wave2, 1e-12), max(slope2, 1e-12)
 
 
 @strict

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, i32, u8, u64
+from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, fill, i32, u8, u64
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
 from bayes3d_ros.likelihood.cpu.packing import lesser
 from bayes3d_ros.likelihood.cpu.windows import exp, log, windows_with
@@ -25,6 +25,9 @@ from bayes3d_ros.likelihood.shared_errors import (
 
 NOTHING, TABLE, OLD, NEW = 0, 1, 2, 3  # labels: the objects that were there before are one
 NOT_SCORED, UNKNOWN, EDGE, CELL, HIDDEN = 0, 1, 2, 3, 4  # kinds
+_BEHIND, _GOES_ON = 5, 6  # while kinds are found: in front of their own surface, behind an object of their window
+_SLOTS = 16  # of the points in a window: whole vectors
+_NO_OBJECT = 1e6  # metres, to no object
 
 
 class Returns(NamedTuple):
@@ -33,7 +36,7 @@ class Returns(NamedTuple):
     bare: Float[np.ndarray, "H*W"]
     spread: Float[np.ndarray, "H*W"]
     table_margin: Float[np.ndarray, "H*W"]
-    unknown: Float[np.ndarray, "S*H*W"]
+    own_plane: Float[np.ndarray, "S*H*W"]
     rows: int  # of the arrays
     columns: int
 
@@ -45,38 +48,51 @@ class ScenePixels(NamedTuple):
     label: Int[np.ndarray, "I"]
     kind: Int[np.ndarray, "I"]
     near_outline: Int[np.ndarray, "I"]  # pixels about those with several surfaces
+    of_object: Int[np.ndarray, "I"]  # returns that are as far as an object in their window
 
 
 class Patch(NamedTuple):
-    """The bare table in the patch, and what one scene after the other is worked out in."""
+    """The bare table and the margins in the patch, and what one scene after the other is worked out in."""
 
     bare: Float[np.ndarray, "I"]
+    margin: Float[np.ndarray, "I"]
     several: Int[np.ndarray, "I"]
     front: Float[np.ndarray, "I"]  # the least depth of the pixel and of objects in its window
-    beside: Int[np.ndarray, "I"]  # whether there are any
+    apart: Float[np.ndarray, "I"]  # metres of depth between a return and the nearest such object
     nowhere: Int[np.ndarray, "I"]  # no flag: nothing that a scene changes
+    changes: Int[np.ndarray, "I"]  # pixels that are scored otherwise with the new object
+    row: Int[np.ndarray, "I"]
 
 
 @allocating
 def new_patch(size):
-    none = np.zeros(size, np.uint8)
-    return Patch(np.zeros(size, np.float32), none, np.zeros(size, np.float32), none.copy(), none.copy())
+    number, flag = np.zeros(size, np.float32), np.zeros(size, np.uint8)
+    return Patch(number, number.copy(), flag, number.copy(), number.copy(), flag.copy(), flag.copy(), flag.copy())
 
 
 @allocating
 def new_scene_pixels(depth):
     none = np.zeros(len(depth), np.uint8)
-    return ScenePixels(depth, none, none.copy(), none.copy())
+    return ScenePixels(depth, none, none.copy(), none.copy(), none.copy())
 
 
 @strict
-def begin_bare(returns, bare, stride, size, left, top, height):
-    """Depth of the bare table in the patch, NO_SURFACE_METRES outside of the image."""
-    for k in range(size):
-        bare[k] = f32(NO_SURFACE_METRES)
+def begin_table(returns, patch, stride, size, left, top, height):
+    """The bare table in the patch, NO_SURFACE_METRES outside of the image, and its margins."""
+    fill(patch.bare, size, f32(NO_SURFACE_METRES))
+    fill(patch.margin, size, f32(0))
+    first, last = max(left, 0), min(left + stride, returns.columns)
     for v in range(max(top, 0), min(top + size // stride, height)):
-        for u in range(max(left, 0), min(left + stride, returns.columns)):
-            bare[(v - top) * stride + u - left] = min(returns.bare[v * returns.columns + u], f32(NO_SURFACE_METRES))
+        at, to = v * returns.columns + first, (v - top) * stride + first - left
+        _copy_row(returns.bare, at, last - first, f32(NO_SURFACE_METRES), patch.bare, to)
+        _copy_row(returns.table_margin, at, last - first, f32(NO_SURFACE_METRES), patch.margin, to)
+
+
+@fast
+def _copy_row(source, at, count, most, found, to):
+    at, to = u64(at), u64(to)
+    for k in range(u64(count)):
+        found[to + k] = lesser(source[at + k], most)
 
 
 @fast
@@ -90,11 +106,11 @@ def _find_labels(depth, bare, changed, size, label):
 
 
 @fast
-def _find_several(depth, label, first, last, stride, step_x, step_y, several, front, beside):
-    """Pixels whose windows show several surfaces; and the objects there."""
+def _find_several(depth, label, seen, first, last, stride, step_x, step_y, several, front, apart_from):
+    """Pixels whose windows show several surfaces; and the objects there. seen: depth of the returns."""
     for k in range(u64(first), u64(last)):
         several[k] = u8(label[k] == u8(NOTHING))
-        front[k], beside[k] = depth[k], u8(0)
+        front[k], apart_from[k] = depth[k], f32(_NO_OBJECT)
     for dv in range(-1, 2):
         for du in range(-1, 2):
             limit = f32(STEEPEST) * max(f32(abs(dv)) * step_y, f32(abs(du)) * step_x)
@@ -107,92 +123,138 @@ def _find_several(depth, label, first, last, stride, step_x, step_y, several, fr
                 several[k] |= u8((there != u8(NOTHING)) & steep)
                 of_object = there >= u8(OLD)
                 front[k] = lesser(front[k], depth[other] if of_object else f32(NO_SURFACE_METRES))
-                beside[k] |= u8(of_object)
+                away_from = abs(seen[k] - depth[other])
+                apart_from[k] = lesser(apart_from[k], away_from if of_object else f32(_NO_OBJECT))
+
+
+@fast
+def _find_kinds(space, scene, patch, front_margin, first, last):
+    """Kinds of pixels between two; whether any is `_BEHIND`."""
+    depth, label, kind, of_object = scene.depth, scene.label, scene.kind, scene.of_object
+    several, front, apart, margins, seen = patch.several, patch.front, patch.apart, patch.margin, space.depth
+    pixel_class = space.pixel_class
+    any_behind = u8(0)
+    for k in range(u64(first), u64(last)):
+        z, margin = seen[k], margins[k]
+        inside, beyond = pixel_class[k] == i32(IN_WORKSPACE), pixel_class[k] == i32(BEYOND)
+        wider = margin + f32(BAD_DEPTH)
+        near = apart[k] < wider
+        before_own = z < depth[k] - (wider if label[k] >= u8(OLD) else margin)
+        unknown = z < front[k] - (wider if apart[k] < f32(_NO_OBJECT) else margin)
+        behind = before_own & (not near)
+        scored = u8(EDGE) if several[k] != u8(0) else u8(CELL)
+        scored = u8(_BEHIND) if behind else scored
+        scored = u8(UNKNOWN) if unknown else scored
+        hidden = beyond & (depth[k] < z + front_margin)
+        other = u8(HIDDEN) if hidden else u8(NOT_SCORED)
+        kind[k] = scored if inside else other
+        of_object[k] = u8(near & inside)
+        any_behind |= u8(kind[k] == u8(_BEHIND))
+    return any_behind
 
 
 @strict
-def _find_kinds(picture, returns, space, depth, patch, stride, size, border, left, top, kind):
-    for k in range(size):
-        kind[k] = u8(NOT_SCORED)
-    rows, columns = size // stride, stride
-    several, front, beside = patch.several, patch.front, patch.beside
+def _go_on(space, patch, scene, stride, size, border):
+    """Returns behind an object of their window: unknown where the depth of something unknown goes on."""
+    kind, z, rows = scene.kind, space.depth, size // stride
     for v in range(border, rows - border):
-        for u in range(border, columns - border):
+        for u in range(border, stride - border):
             k = v * stride + u
-            sort = space.pixel_class[k]
-            z = space.depth[k]
-            if sort == IN_WORKSPACE:
-                margin = returns.table_margin[(v + top) * returns.columns + u + left]
-                if beside[k]:
-                    margin += f32(BAD_DEPTH)
-                if z < front[k] - margin:
-                    kind[k] = u8(UNKNOWN)
-                else:
-                    kind[k] = u8(EDGE) if several[k] else u8(CELL)
-            elif sort == BEYOND and depth[k] < z + picture.front_margin:
-                kind[k] = u8(HIDDEN)
+            if kind[k] != _BEHIND:
+                continue
+            for other in (k - stride, k - 1, k + 1, k + stride):
+                if kind[other] == UNKNOWN and abs(z[other] - z[k]) < SEAM_DEPTH:
+                    kind[k] = u8(_GOES_ON)
+    for k in range(size):
+        if kind[k] == _GOES_ON:
+            kind[k] = u8(UNKNOWN)
+        elif kind[k] == _BEHIND:
+            kind[k] = u8(EDGE) if patch.several[k] else u8(CELL)
 
 
 @strict
-def sort_scene(picture, returns, space, patch, scene, changed, stride, size, border, left, top):
+def sort_scene(picture, space, patch, scene, changed, stride, size, border):
     """What each pixel of a scene is; `changed`: where it shows the new object."""
     first, last = border * stride + border, size - border * stride - border
     step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
     _find_labels(scene.depth, patch.bare, changed, size, scene.label)
     _find_several(
-        scene.depth, scene.label, first, last, stride, step_x, step_y, patch.several, patch.front, patch.beside
-    )
-    _find_kinds(picture, returns, space, scene.depth, patch, stride, size, border, left, top, scene.kind)
+        scene.depth, scene.label, space.depth, first, last, stride, step_x, step_y, patch.several, patch.front,
+        patch.apart,
+    )  # fmt: skip
+    # The border has no flags: what is there belongs to the last patch, or to the end of another row.
+    for k in range(first):
+        patch.several[k], patch.several[size - 1 - k] = u8(0), u8(0)
+    for k in range(0, size, stride):
+        for b in range(border):
+            patch.several[k + b], patch.several[k + stride - 1 - b] = u8(0), u8(0)
+    for k in range(first):
+        scene.kind[k], scene.kind[size - 1 - k] = u8(NOT_SCORED), u8(NOT_SCORED)
+    if _find_kinds(space, scene, patch, picture.front_margin, first, last) != 0:
+        _go_on(space, patch, scene, stride, size, border)
     windows_with(patch.several, size, stride, border, space.wider, scene.near_outline)
 
 
-@strict
-def mask_nats(space, label, kind, stride, size, border):
-    """Prior's nats of the outlines of what is unknown, negative."""
-    sides, seams = 0, 0
-    rows = size // stride
-    for v in range(border, rows - border):
-        for u in range(border, stride - border):
-            k = v * stride + u
-            if space.pixel_class[k] != IN_WORKSPACE:
-                continue
-            for away in (1, stride):
-                other = k + away
-                if (away == 1 and u + 1 >= stride - border) or (away != 1 and v + 1 >= rows - border):
-                    continue
-                if space.pixel_class[other] != IN_WORKSPACE or (kind[k] == UNKNOWN) == (kind[other] == UNKNOWN):
-                    continue
-                sides += 1
-                known = label[other] if kind[k] == UNKNOWN else label[k]
-                if known >= OLD and abs(space.depth[k] - space.depth[other]) < SEAM_DEPTH:
-                    seams += 1
+@fast
+def mask_nats(space, scene, first, last, stride):
+    """Prior's nats of the outlines of what is unknown, negative. The border holds no pixel of the image's workspace."""
+    kind, of_object, depth, pixel_class = scene.kind, scene.of_object, space.depth, space.pixel_class
+    sides, seams = i32(0), i32(0)
+    for away in (1, stride):
+        step = u64(away)
+        for k in range(u64(first), u64(last)):
+            unknown, other = kind[k] == u8(UNKNOWN), kind[k + step] == u8(UNKNOWN)
+            both = (pixel_class[k] == i32(IN_WORKSPACE)) & (pixel_class[k + step] == i32(IN_WORKSPACE))
+            side = both & (unknown != other)
+            known = of_object[k + step] if unknown else of_object[k]
+            sides += i32(side)
+            seams += i32(side & (known != u8(0)) & (abs(depth[k] - depth[k + step]) < f32(SEAM_DEPTH)))
     return -OUTLINE_NATS * sides - SEAM_NATS * seams
 
 
+@fast
+def find_changes(space, now, former, first, last, changes):
+    """Pixels that are scored otherwise than before, into changes; the sum of depths and the number of the pixels that
+    show the new object alone."""
+    seen, kind, before = space.seen, now.kind, former.kind
+    near, near_before, label, depth = now.near_outline, former.near_outline, now.label, now.depth
+    metres, pixels = f32(0.0), f32(0.0)
+    for k in range(u64(first), u64(last)):
+        changes[k] = seen[k] | u8(near[k] != near_before[k]) | u8(kind[k] != before[k])
+        own = (kind[k] == u8(CELL)) & (label[k] == u8(NEW))
+        metres += depth[k] if own else f32(0.0)
+        pixels += f32(1.0) if own else f32(0.0)
+    return metres, pixels
+
+
+@fast
+def gather_rows(changes, at, stride, rows, count, found):
+    """found[u]: whether there is a change in the column u of so many rows."""
+    at, stride = u64(at), u64(stride)
+    for u in range(u64(count)):
+        found[u] = u8(0)
+    for row in range(u64(rows)):
+        for u in range(u64(count)):
+            found[u] |= changes[at + row * stride + u]
+
+
 @strict
-def log_edge(picture, returns, space, depth, label, k, stride, left, top, sigma, p, amplitudes, table):
-    """log density of the return of an edge pixel."""
+def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes, window, values):
+    """log density of the return of an edge pixel at every pair of noise, into values. window: 4 rows of numbers to
+    work in, and 3: weights of what is 0, 1 and 2 squared pixels farther away than the nearest."""
+    sigma, p_outlier, table, _, amplitudes = nodes
     row, column = k // stride, k - k // stride * stride
     x, y = picture.ray_x[column + left], picture.ray_y[row + top]
     z = space.depth[k]
     norm2 = f32(1.0) + x * x + y * y
     outlier = picture.outlier_scale * z * z
-    noise = sigma * returns.spread[(row + top) * returns.columns + column + left]
+    spread = returns.spread[(row + top) * returns.columns + column + left]
     of_object = amplitudes[0] * amplitudes[0] + amplitudes[1] * amplitudes[1] + amplitudes[3] * amplitudes[3]
-    nearest, least = f32(1e30), f32(1e30)
+    of_table = table[len(table) // 2] * table[len(table) // 2]
     step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
-    for dv in range(-1, 2):
-        for du in range(-1, 2):
-            d = depth[k + dv * stride + du]
-            if d < f32(NO_SURFACE_METRES):
-                ex, ey = f32(du) * step_x, f32(dv) * step_y
-                turned = ex * y - ey * x
-                nearest = min(nearest, d * d * (ex * ex + ey * ey + turned * turned) / norm2)
-                least = min(least, f32(du * du + dv * dv))
-    if nearest >= f32(1e30):
-        return log(p * outlier + (f32(1.0) - p) * outlier)
-    total, weights, blur = f32(0.0), f32(0.0), f32(amplitudes[6])
-    front, back = f32(NO_SURFACE_METRES), f32(0.0)
+    offs, owns, acrosses, weights = window[0], window[1], window[2], window[3]
+    nearest, least, count = f32(1e30), 9, 0
+    front, back, of_objects = f32(NO_SURFACE_METRES), f32(0.0), False
     for dv in range(-1, 2):
         for du in range(-1, 2):
             d = depth[k + dv * stride + du]
@@ -200,20 +262,57 @@ def log_edge(picture, returns, space, depth, label, k, stride, left, top, sigma,
                 ex, ey = f32(du) * step_x, f32(dv) * step_y
                 turned = ex * y - ey * x
                 across = d * d * (ex * ex + ey * ey + turned * turned) / norm2
-                if blur > 0:
-                    weight = exp(f32(-0.5) * (f32(du * du + dv * dv) - least) / (blur * blur))
-                else:
-                    weight = exp(f32(-0.5) * (across - nearest) / (noise * noise)) + f32(LATERAL)
-                own = table * table if label[k + dv * stride + du] == TABLE else of_object
-                variance = noise * noise / norm2 + f32(own)
-                off = z - d * (f32(1.0) + (ex * x + ey * y) / norm2)
-                inlier = exp(f32(-0.5) * off * off / variance) / np.sqrt(f32(2 * np.pi) * variance)
-                total += weight * inlier
-                weights += weight
+                nearest, least = min(nearest, across), min(least, du * du + dv * dv)
+                on_table = label[k + dv * stride + du] == TABLE
+                of_objects |= not on_table
+                offs[count] = z - d * (f32(1.0) + (ex * x + ey * y) / norm2)
+                owns[count] = of_table if on_table else f32(of_object)
+                acrosses[count], weights[count] = across, f32(du * du + dv * dv)
                 front, back = min(front, d), max(back, d)
-    back = max(back, front + f32(4.0) * noise)
-    between = f32(1.0) / (back - front) if front < z < back else f32(0.0)
-    share = f32(amplitudes[5])
-    inside = (f32(1.0) - share) * total / weights + share * between
+                count += 1
+    blur, bad, share = f32(amplitudes[6]), f32(amplitudes[4]), f32(amplitudes[5])
+    dented = f32(1 / BAD_DEPTH) if (z < front) & (z > front - f32(BAD_DEPTH)) else f32(0.0)
     lost = f32(LOST_SHARE / LOST_DEPTH) * share
-    return log(p * outlier + lost + (f32(1.0) - p) * inside)
+    if blur > 0:
+        for c in range(count):
+            weights[c] = window[4][i32(weights[c]) - least]
+        for c in range(count, _SLOTS):
+            weights[c] = f32(0.0)
+    for s in range(len(sigma)):
+        p, noise = p_outlier[s], sigma[s] * spread
+        if count == 0:
+            values[s] = log(p * outlier + (f32(1.0) - p) * outlier)
+            continue
+        if blur <= 0:
+            for c in range(count):
+                weights[c] = exp(f32(-0.5) * (acrosses[c] - nearest) / (noise * noise)) + f32(LATERAL)
+            for c in range(count, _SLOTS):
+                weights[c] = f32(0.0)
+        mixture = _mixture(weights, offs, owns, noise * noise / norm2)
+        if of_objects:
+            mixture = (f32(1.0) - bad) * mixture + bad * dented
+        behind = max(back, front + f32(4.0) * noise)
+        between = f32(1.0) / (behind - front) if front < z < behind else f32(0.0)
+        inside = (f32(1.0) - share) * mixture + share * between
+        values[s] = log(p * outlier + lost + (f32(1.0) - p) * inside)
+
+
+@fast
+def _mixture(weights, offs, owns, noise2):
+    """The mean of normal densities at `offs`, of variances `noise2` + `owns`, all slots side by side."""
+    total, all_weights = f32(0.0), f32(0.0)
+    for c in range(u64(_SLOTS)):
+        precision = f32(1.0) / (noise2 + owns[c])
+        density = exp(f32(-0.5) * offs[c] * offs[c] * precision) * np.sqrt(precision * f32(1 / (2 * np.pi)))
+        total += weights[c] * density
+        all_weights += weights[c]
+    return total / all_weights
+
+
+@allocating
+def new_window(blur):
+    """What `log_edge` works in."""
+    window = np.ones((5, _SLOTS), np.float32)
+    for k in range(3):
+        window[4, k] = np.exp(f32(-0.5) * f32(k) / (blur * blur)) if blur > 0 else f32(0)
+    return window

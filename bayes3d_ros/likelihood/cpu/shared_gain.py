@@ -5,8 +5,15 @@ numba compiles, as XLA calls them on CPUs."""
 
 import numpy as np
 
-from bayes3d_ros.likelihood.cpu.buffers import f32, new_space
-from bayes3d_ros.likelihood.cpu.cells import CELLS_SIDE_BY_SIDE, find_modes, new_batch, normal_cells, table_cells
+from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
+from bayes3d_ros.likelihood.cpu.cells import (
+    CELLS_SIDE_BY_SIDE,
+    NO_MODE,
+    find_modes,
+    new_batch,
+    normal_cells,
+    table_cells,
+)
 from bayes3d_ros.likelihood.cpu.compiling import handler, strict
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.object_cells import (
@@ -27,28 +34,61 @@ from bayes3d_ros.likelihood.cpu.patches import (
     TABLE,
     UNKNOWN,
     Returns,
-    begin_bare,
+    begin_table,
+    find_changes,
+    gather_rows,
     log_edge,
     mask_nats,
     new_patch,
     new_scene_pixels,
+    new_window,
     sort_scene,
 )
 from bayes3d_ros.likelihood.cpu.windows import begin_patch, log, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
-from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SEEN_THROUGH
 
 SHARED_GAIN_TARGET = "bayes3d_shared_gain_of_hypotheses"
-REACH = 2  # pixels from one that a hypothesis changes, to which its outlines matter
+REACH = 4  # pixels from one that a hypothesis changes, to which its outlines, and what goes on there, matter
 WARP = 3  # numbers of the shared error of an object: metres at the image's first pixel, a column, a row
 
 
 @strict
-def _gather(picture, returns, space, scene, lost, sign, rectangle, stride, left, top, label, batch, used):
-    """The cell of one label in a block, as the next of the batch; whether there is one."""
+def _median(residual, used, count, ordered):
+    """Of a cell's residuals; `ordered` is worked in: insertion."""
+    for a in range(count):
+        value, b = residual[a * CELLS_SIDE_BY_SIDE + used], a
+        while b > 0 and ordered[b - 1] > value:
+            ordered[b] = ordered[b - 1]
+            b -= 1
+        ordered[b] = value
+    middle = count // 2
+    return ordered[middle] if count % 2 else f32(0.5) * (ordered[middle] + ordered[middle - 1])
+
+
+@strict
+def _labels_of_cells(scene, rectangle, stride, left, top):
+    """A bit for each label that has a cell in a block."""
     u0, u1, v0, v1 = rectangle
+    bits = 0
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            k = (v - top) * stride + u - left
+            if scene.kind[k] == CELL:
+                bits |= 1 << scene.label[k]
+    return bits
+
+
+@strict
+def _gather(
+    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
+):
+    """The cell of one label in a block, as the next of the batch."""
+    u0, u1, v0, v1 = rectangle
+    planes, returns_sorted = cell_work
     slot, w = 0, CELLS_SIDE_BY_SIDE
     column, row = 0.0, 0.0
+    planes[:] = f32(0)
     for v in range(v0, v1):
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
@@ -63,30 +103,18 @@ def _gather(picture, returns, space, scene, lost, sign, rectangle, stride, left,
             batch.root[at] = np.sqrt(precision * f32(1 / (2 * np.pi)))
             batch.outlier[at] = picture.outlier_scale * z * z
             batch.lost[at] = lost if scene.near_outline[k] != 0 else f32(0.0)
+            for s in range(len(planes) if label != TABLE else 0):
+                planes[s] += returns.own_plane[(s * returns.rows + v) * returns.columns + u]
             column, row = column + u, row + v
             slot += 1
-    if slot == 0:
-        return False
     count = slot
-    # The median, by sorting the cell's returns: insertion, in place.
-    for a in range(1, count):
-        for b in range(a, 0, -1):
-            one, other = (b - 1) * w + used, b * w + used
-            if batch.residual[one] <= batch.residual[other]:
-                break
-            batch.residual[one], batch.residual[other] = batch.residual[other], batch.residual[one]
-            batch.precision[one], batch.precision[other] = batch.precision[other], batch.precision[one]
-            batch.root[one], batch.root[other] = batch.root[other], batch.root[one]
-            batch.outlier[one], batch.outlier[other] = batch.outlier[other], batch.outlier[one]
-            batch.lost[one], batch.lost[other] = batch.lost[other], batch.lost[one]
-    middle = count // 2
-    median = batch.residual[middle * w + used]
-    if count % 2 == 0:
-        median = f32(0.5) * (median + batch.residual[(middle - 1) * w + used])
+    median = _median(batch.residual, used, count, returns_sorted)
     batch.start[used] = median
-    batch.label[used], batch.sign[used] = label, sign
+    near = (median > f32(-BAD_DEPTH)) & (median < f32(SEEN_THROUGH)) & (label != TABLE)
+    for s in range(len(batch.own_plane) // w):
+        batch.own_plane[s * w + used] = planes[s] if near else NO_MODE
+    batch.label[used], batch.place_of_sum[used] = label, place_of_sum
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
-    return True
 
 
 @strict
@@ -96,17 +124,15 @@ def _clear(batch, returns):
         batch.residual[k], batch.precision[k], batch.root[k], batch.outlier[k] = f32(0), f32(1), f32(0), f32(1)
         batch.lost[k] = f32(0)
     for c in range(w):
-        batch.start[c], batch.label[c], batch.sign[c] = f32(0), 0, f32(0)
+        batch.start[c], batch.label[c], batch.place_of_sum[c] = f32(0), 0, 0
 
 
 @strict
-def _sum_of_cells(batch, used, label):
-    """The sum of the batch's values, of cells of one label."""
-    total = 0.0
+def _add_cells(batch, used, label, sums, column):
+    """The batch's values, of cells of one label, to the rows of sums that they belong to."""
     for c in range(used):
         if batch.label[c] == label:
-            total += batch.sign[c] * batch.value[c]
-    return total
+            sums[batch.place_of_sum[c], column] += batch.value[c]
 
 
 @strict
@@ -120,13 +146,13 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
         of_old += 1 if batch.label[c] == OLD else 0
         of_new += 1 if batch.label[c] == NEW else 0
     for s in range(len(sigma)):
-        find_modes(batch, returns, sigma[s], p_outlier[s])
+        find_modes(batch, returns, sigma[s], p_outlier[s], s == 0)
         for t in range(tables if of_table > 0 else 0):
             table_cells(batch, table[t] * table[t])
-            fixed[s * tables + t] += _sum_of_cells(batch, used, TABLE)
+            _add_cells(batch, used, TABLE, fixed, s * tables + t)
         for a in range(scales if of_old > 0 else 0):
-            normal_cells(batch, f32((scale[a] * amplitudes[3]) ** 2), amplitudes[4])
-            old[s * scales + a] += _sum_of_cells(batch, used, OLD)
+            normal_cells(batch, s, f32((scale[a] * amplitudes[3]) ** 2), amplitudes[4])
+            _add_cells(batch, used, OLD, old, s * scales + a)
         kept = new_cells
         for c in range(used if of_new > 0 else 0):
             if batch.label[c] != NEW:
@@ -137,103 +163,148 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
                 own.place[at] = batch.place[which * w + c]
                 own.curvature[at] = batch.curvature[which * w + c]
             own.outliers[s * most + kept] = batch.outliers[c]
+            own.bad[s * most + kept] = batch.own_plane[s * w + c]
             own.column[kept], own.row[kept], own.number[kept] = batch.column[c], batch.row[c], batch.number[c]
             kept += 1
     return new_cells + of_new
 
 
 @strict
-def _score_pixels(picture, returns, space, scene, sign, rectangle, stride, left, top, nodes, fixed):
-    """What returns that belong to no cell say."""
+def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
+    """What returns that belong to no cell say, added to sums."""
     sigma, p_outlier, table, _, amplitudes = nodes
+    window, values = work
     u0, u1, v0, v1 = rectangle
     tables = len(table)
-    middle = table[tables // 2]
     for v in range(v0, v1):
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
             kind = scene.kind[k]
             if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
                 continue
+            if kind == EDGE:
+                log_edge(picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, window, values)
             for s in range(len(sigma)):
-                if kind == UNKNOWN:
-                    value = returns.unknown[(s * returns.rows + v) * returns.columns + u]
-                elif kind == EDGE:
-                    value = log_edge(
-                        picture, returns, space, scene.depth, scene.label, k, stride, left, top, sigma[s], p_outlier[s],
-                        amplitudes, middle,
-                    )  # fmt: skip
-                else:
-                    value = log(p_outlier[s])
+                if kind == UNKNOWN and amplitudes[8] > 0:
+                    values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
+                elif kind == UNKNOWN:
+                    values[s] = log(p_outlier[s] * picture.outlier_scale * space.depth[k] * space.depth[k])
+                elif kind == HIDDEN:
+                    lost = f32(LOST_SHARE) * amplitudes[5] if scene.near_outline[k] != 0 else f32(0.0)
+                    values[s] = log(p_outlier[s] + lost)
                 for t in range(tables):
-                    fixed[s * tables + t] += sign * value
+                    sums[s * tables + t] += values[s]
+
+
+@strict
+def _find_touched(changes, rectangle, block, stride, left, top, across, row, touched):
+    """The blocks that hold a change, by number, into touched; how many. `row` is worked in."""
+    u0, u1, v0, v1 = rectangle
+    count = 0
+    for v in range(v0, v1, block):
+        gather_rows(changes, (v - top) * stride + u0 - left, stride, min(block, v1 - v), u1 - u0, row)
+        for u in range(u0, u1, block):
+            changed = u8(0)
+            for k in range(u - u0, min(u + block, u1) - u0):
+                changed |= row[k]
+            if changed != u8(0):
+                touched[count] = v // block * across + u // block
+                count += 1
+    return count
+
+
+@strict
+def _score_blocks(
+    picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
+    one_row,
+):  # fmt: skip
+    """What blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how many cells of
+    the new object were kept."""
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
+    lost = f32(LOST_SHARE / LOST_DEPTH) * nodes[4][5]
+    used, new_cells = 0, 0
+    _clear(batch, returns_a_cell)
+    for number in blocks:
+        v, u = number // across * block, number % across * block
+        here = (u, min(u + block, width), v, min(v + block, height))
+        place = 0 if one_row else number
+        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, work, fixed[place])
+        here_labels = _labels_of_cells(scene, here, stride, left, top)
+        for label in range(TABLE, NEW + 1):
+            if here_labels >> label & 1 == 0:
+                continue
+            _gather(picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work)
+            used += 1
+            if used == CELLS_SIDE_BY_SIDE:
+                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+                used = 0
+                _clear(batch, returns_a_cell)
+    if used > 0:
+        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+    return new_cells
 
 
 @strict
 def _gain_of(
     things, n, objects, picture, returns, scenes, scene_at, scene_stride, block, nodes, space, patch, now, former,
-    batch, own, fixed, old, sums, gain, warp,
+    batch, own, work, sums, former_sums, gain, warp,
 ):  # fmt: skip
     sigma, p_outlier, table, scale, amplitudes = nodes
+    fixed, old, touched, pixel_work, cell_work = work
+    known, former_fixed, former_old = former_sums
     border, tables, scales = 1, len(table), len(scale)
     height, width = len(picture.ray_y), len(picture.ray_x)
     rectangle = find_outlines(things, n, objects, picture, space)
     if rectangle[1] <= rectangle[0]:
         return
-    # Whole blocks, of all pixels whose windows may change, or those of their neighbours.
-    u0, v0 = max(rectangle[0] - REACH, 0) // block * block, max(rectangle[2] - REACH, 0) // block * block
-    u1 = min((rectangle[1] + REACH + block - 1) // block * block, width)
-    v1 = min((rectangle[3] + REACH + block - 1) // block * block, height)
+    # Whole blocks, of all pixels whose windows may change, or those of their neighbours; and what is about those.
+    reach = REACH + block
+    u0, v0 = max(rectangle[0] - reach, 0) // block * block, max(rectangle[2] - reach, 0) // block * block
+    u1 = min((rectangle[1] + reach + block - 1) // block * block, width)
+    v1 = min((rectangle[3] + reach + block - 1) // block * block, height)
     stride, size, left, top = begin_patch(picture, scenes, scene_at, scene_stride, (u0, u1, v0, v1), border, space)
     render_all(things, n, objects, picture, now.depth, stride, -top * stride - left, space)
     mark_changes(now.depth, former.depth, size, space.changed)
     windows_with(space.changed, size, stride, border, space.wider, space.seen)
-    begin_bare(returns, patch.bare, stride, size, left, top, height)
-    sort_scene(picture, returns, space, patch, now, space.changed, stride, size, border, left, top)
-    sort_scene(picture, returns, space, patch, former, patch.nowhere, stride, size, border, left, top)
-    lost = f32(LOST_SHARE / LOST_DEPTH) * amplitudes[5]
+    begin_table(returns, patch, stride, size, left, top, height)
+    sort_scene(picture, space, patch, now, space.changed, stride, size, border)
+    sort_scene(picture, space, patch, former, patch.nowhere, stride, size, border)
+    first, last = border * stride + border, size - border * stride - border
     mask = 0.0
-    if amplitudes[7] > 0:  # there are unknown things
-        mask = mask_nats(space, now.label, now.kind, stride, size, border)
-        mask -= mask_nats(space, former.label, former.kind, stride, size, border)
-    for k in range(len(fixed)):
-        fixed[k] = mask
-    for k in range(len(old)):
-        old[k] = 0.0
-    returns_a_cell, most = block * block, len(own.column)
-    used, new_cells, metres, pixels = 0, 0, 0.0, 0
-    _clear(batch, returns_a_cell)
-    for v in range(v0, v1, block):
-        for u in range(u0, u1, block):
-            here = (u, min(u + block, u1), v, min(v + block, v1))
-            touched = False
-            for y in range(here[2], here[3]):
-                for x in range(here[0], here[1]):
-                    k = (y - top) * stride + x - left
-                    touched |= space.seen[k] != 0 or now.near_outline[k] != former.near_outline[k]
-                    if now.kind[k] == CELL and now.label[k] == NEW:
-                        metres += now.depth[k]
-                        pixels += 1
-            if not touched:
-                continue
-            _score_pixels(picture, returns, space, now, 1.0, here, stride, left, top, nodes, fixed)
-            _score_pixels(picture, returns, space, former, -1.0, here, stride, left, top, nodes, fixed)
-            for label in (TABLE, OLD, NEW):
-                for scene, sign in ((former, f32(-1.0)), (now, f32(1.0))):
-                    if _gather(picture, returns, space, scene, lost, sign, here, stride, left, top, label, batch, used):
-                        used += 1
-                    if used == CELLS_SIDE_BY_SIDE:
-                        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
-                        used = 0
-                        _clear(batch, returns_a_cell)
-    if used > 0:
-        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+    if amplitudes[8] > 0:  # there are unknown things
+        mask = mask_nats(space, now, first, last, stride)
+        mask -= mask_nats(space, former, first, last, stride)
+    across = (width + block - 1) // block
+    metres, pixels = find_changes(space, now, former, first, last, patch.changes)
+    count = _find_touched(patch.changes, (u0, u1, v0, v1), block, stride, left, top, across, patch.row, touched)
+    fixed[0, :], old[0, :] = mask, 0.0
+    new_cells = _score_blocks(
+        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, pixel_work, cell_work, batch,
+        own, fixed, old, True,
+    )  # fmt: skip
+    # What a block says of the scene as it was is worked out once for all that is added to that scene.
+    fresh = 0
+    for k in range(count):
+        if known[touched[k]] == 0:
+            known[touched[k]] = 1
+            touched[count + fresh] = touched[k]
+            fresh += 1
+    _score_blocks(
+        picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
+        pixel_work, cell_work, batch, own, former_fixed, former_old, False,
+    )  # fmt: skip
+    for k in range(count):
+        for level in range(fixed.shape[1]):
+            fixed[0, level] -= former_fixed[touched[k], level]
+        for level in range(old.shape[1]):
+            old[0, level] -= former_old[touched[k], level]
     metres = f32(metres / max(pixels, 1) / picture.focal_x)
-    error = sums[12:15]
+    error, most = sums[12:15], len(own.column)
     if new_cells > 0:
         column, row = place_cells(own, new_cells, metres)
         for s in range(len(sigma)):
-            begin_object(own, s, most, new_cells)
+            begin_object(own, s, most, new_cells, amplitudes[4])
         # One paraboloid for all nodes: about the mode at the middle one.
         find_shared_error(own, len(sigma) // 2, most, new_cells, scale[scales // 2], amplitudes, sums, error)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
@@ -241,11 +312,17 @@ def _gain_of(
     for s in range(len(sigma)):
         level = reference_height(own, s, most, new_cells) if new_cells > 0 else 0.0
         for a in range(scales):
-            value = old[s * scales + a] + level
+            value = old[0, s * scales + a] + level
             if new_cells > 0:
                 value += log_object(own, s, most, new_cells, scale[a], amplitudes, sums, error)
             for t in range(tables):
-                gain[(s * tables + t) * scales + a] = value + fixed[s * tables + t]
+                gain[(s * tables + t) * scales + a] = value + fixed[0, s * tables + t]
+
+
+@strict
+def _forget(former_sums):
+    known, fixed, old = former_sums
+    known[:], fixed[:], old[:] = 0, 0.0, 0.0
 
 
 @handler
@@ -266,20 +343,31 @@ def _shared_gain(frame):
     count, objects = len(planes) // 4, objects_each(things, planes)
     height, width = len(picture.ray_y), len(picture.ray_x)
     space = new_space(height, width, 1, objects, most_corners(things))
-    patch, batch = new_patch(len(space.patch)), new_batch(block * block)
-    now, former = new_scene_pixels(space.patch), new_scene_pixels(space.before)
     pairs, tables, scales = len(nodes[0]), len(nodes[2]), len(nodes[3])
-    own = new_object_cells(pairs, (height // block + 1) * (width // block + 1))
-    fixed, old, sums = np.zeros(pairs * tables), np.zeros(pairs * scales), np.zeros(17)
-    levels = pairs * tables * scales
+    patch, batch = new_patch(len(space.patch)), new_batch(block * block, pairs)
+    now, former = new_scene_pixels(space.patch), new_scene_pixels(space.before)
+    blocks = (height // block + 1) * (width // block + 1)
+    own = new_object_cells(pairs, blocks)
+    work = (
+        np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
+        (new_window(nodes[4][6]), np.zeros(pairs, np.float32)),
+        (np.zeros(pairs), np.zeros(block * block, np.float32)),
+    )  # fmt: skip
+    former_sums = (
+        np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
+    )  # fmt: skip
+    sums, levels, last = np.zeros(15), pairs * tables * scales, -1
     for k in range(len(gain)):
         gain[k] = f32(0)
     for k in range(len(warp)):
         warp[k] = f32(0)
     for n in range(count):
+        if ancestor[n] != last:
+            _forget(former_sums)
+            last = ancestor[n]
         _gain_of(
             things, n, objects, picture, returns, scenes, ancestor[n] * scene_rows * scene_columns, scene_columns,
-            block, nodes, space, patch, now, former, batch, own, fixed, old, sums,
+            block, nodes, space, patch, now, former, batch, own, work, sums, former_sums,
             gain[n * levels : (n + 1) * levels], warp[n * WARP : (n + 1) * WARP],
         )  # fmt: skip
     return 0

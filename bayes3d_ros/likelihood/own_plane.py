@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How likely returns are of a thing of which nothing is known: the likelihood of known objects, the shape integrated
-out.
+"""How likely returns are of a surface of which nothing is known, be it an unknown thing's or a dent in a known one: the
+likelihood of known objects, the shape integrated out.
 
-In each block of the image the thing's surface is a plane of its own, about a surface that faces the camera,
+In each block of the image the surface is a plane of its own, about a surface that faces the camera,
 
     d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `_DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
 
 and its returns err as those of any surface do. Each block's integral is worked out by Laplace's method about the plane
 that its returns make likeliest, for all that stand in front of the table, and is shared out evenly among them: what a
-thing does not cover of a block it does not pay for. So the image alone gives each return's log density.
+surface does not cover of a block it does not pay for. So the image alone gives each return's log density.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ _FIRST_WIDTH = 0.004  # metres: of inliers in the first step; from step to step 
 _FEWEST_INLIERS = 0.5
 
 
-def unknown_log_density(
+def own_plane_log_density(
     image: ScoredImage,
     standing: Bool[np.ndarray, "H W"],
     spread: Float[np.ndarray, "H W"],
