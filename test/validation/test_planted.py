@@ -62,7 +62,7 @@ def test_evidence_about_the_truth_is_the_sum_over_a_grid(drill) -> None:
     empty = empty_likelihood(model, bare, image, SETTINGS.window)
 
     def values(middle, halves):
-        axes = [np.linspace(m - half, m + half, 21) for m, half in zip(middle, halves, strict=True)]
+        axes = [np.linspace(m - half, m + half, 31) for m, half in zip(middle, halves, strict=True)]
         places = [a.ravel() for a in np.meshgrid(*axes, indexing="ij")]
         dx, dy, turn = (jnp.asarray(a, jnp.float32) for a in places)
         zero = jnp.zeros(dx.shape, jnp.int32)
