@@ -26,7 +26,8 @@ from bayes3d_ros.likelihood.scene_score import (
 )
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
-from bayes3d_ros.likelihood.slow_shared_errors import NOTHING, TABLE, log_density
+from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, TABLE
+from bayes3d_ros.likelihood.slow_shared_errors import log_density
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table
 

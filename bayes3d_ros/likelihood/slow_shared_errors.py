@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 from scipy.special import logsumexp
 
-from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, LATERAL
+from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
@@ -21,17 +20,21 @@ from bayes3d_ros.likelihood.shared_errors import (
     LOST_SHARE,
     MODE_STEPS,
     MORE_MODE_STEPS,
-    OUTLINE_NATS,
     REWEIGHTED_STEPS,
     SAME_MODE_SDS,
-    SEAM_DEPTH,
-    SEAM_NATS,
     SEEN_THROUGH,
-    STEEPEST,
     SharedErrorImage,
 )
-
-NOTHING, TABLE, OBJECT = 0, 1, 2  # labels of pixels: object k is OBJECT + k
+from bayes3d_ros.likelihood.slow_pixel_kinds import (
+    NOTHING,
+    OBJECT,
+    TABLE,
+    PixelKinds,
+    around,
+    kinds_of_pixels,
+    mask_nats,
+    shifted,
+)
 
 
 class CellModes(NamedTuple):
@@ -111,94 +114,10 @@ def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: flo
     return logs.sum(1), b, (share * cells.precision).sum(1) / sigma**2, share.sum(1)
 
 
-class _Pixels(NamedTuple):
-    """What each pixel is scored as."""
-
-    unknown: Bool[np.ndarray, "H W"]
-    edge: Bool[np.ndarray, "H W"]
-    cell: Bool[np.ndarray, "H W"]
-    near_outline: Bool[np.ndarray, "H W"]
-    hidden: Bool[np.ndarray, "H W"]  # saw beyond the workspace, through a surface
-    of_object: Bool[np.ndarray, "H W"]  # as far as an object in their window is
-
-
-def kinds_of_pixels(
-    depth: Float[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage
-) -> _Pixels:
-    """depth: of the scene, inf where there is nothing; label: NOTHING, TABLE or OBJECT + k."""
-    observed, pixel_class = np.asarray(image.depth, np.float64), np.asarray(image.pixel_class)
-    rows = np.arange(len(observed))[:, None] < image.own_rows
-    inside = (pixel_class == IN_WORKSPACE) & rows
-    of_object = inside & near_object(observed, depth, label, errors.table_margin)
-    unknown = inside & stands_in_front(observed, depth, label, errors.table_margin)
-    behind = observed < depth - errors.table_margin - np.where(label >= OBJECT, BAD_DEPTH, 0)
-    unknown |= inside & behind & ~of_object & _goes_on(unknown, observed)
-    several = label == NOTHING
-    for dv, du in _around():
-        z, there = _shifted(depth, dv, du, np.inf), _shifted(label, dv, du, NOTHING)
-        apart = max(abs(dv) / float(image.focal[1]), abs(du) / float(image.focal[0]))
-        with np.errstate(invalid="ignore"):
-            steep = np.abs(z - depth) > STEEPEST * apart * depth
-        several = several | ((there != NOTHING) & ((there != label) | steep))
-    scored = inside & ~unknown
-    hidden = (pixel_class == BEYOND) & rows & (depth < observed + float(image.front_margin))
-    near = ndimage.binary_dilation(several & rows, np.ones((3, 3)))
-    return _Pixels(unknown, scored & several, scored & ~several, near, hidden, of_object)
-
-
-def near_object(
-    observed: Float[np.ndarray, "H W"],
-    depth: Float[np.ndarray, "H W"],
-    label: Int[np.ndarray, "H W"],
-    margin: Float[np.ndarray, "H W"],
-) -> Bool[np.ndarray, "H W"]:
-    """Returns that are within `BAD_DEPTH` and a margin, metres, of an object in their window."""
-    near = np.zeros(depth.shape, bool)
-    for dv, du in _around():
-        of_object = _shifted(label, dv, du, NOTHING) >= OBJECT
-        z = np.where(of_object, _shifted(depth, dv, du, np.inf), np.inf)
-        near |= np.abs(observed - z) < margin + BAD_DEPTH
-    return near
-
-
-def _goes_on(which: Bool[np.ndarray, "H W"], observed: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels with one of these above, below, left or right of them, at nearly the same depth."""
-    found = np.zeros(which.shape, bool)
-    for dv, du in ((-1, 0), (0, -1), (0, 1), (1, 0)):
-        apart = np.abs(_shifted(observed, dv, du, np.inf) - observed)
-        found |= _shifted(which, dv, du, False) & (apart < SEAM_DEPTH)
-    return found
-
-
-def stands_in_front(
-    observed: Float[np.ndarray, "H W"],
-    depth: Float[np.ndarray, "H W"],
-    label: Int[np.ndarray, "H W"],
-    margin: Float[np.ndarray, "H W"],
-) -> Bool[np.ndarray, "H W"]:
-    """Returns nearer than the scene, and than any object in their window, by more than a margin, metres: of objects by
-    `BAD_DEPTH` more."""
-    front, beside_object = depth, np.zeros(depth.shape, bool)
-    for dv, du in _around():
-        of_object = _shifted(label, dv, du, NOTHING) >= OBJECT
-        front = np.minimum(front, np.where(of_object, _shifted(depth, dv, du, np.inf), np.inf))
-        beside_object |= of_object
-    return observed < front - margin - np.where(beside_object, BAD_DEPTH, 0.0)
-
-
-def _around() -> list[tuple[int, int]]:
-    return [(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1)]
-
-
-def _shifted(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
-    grown = np.pad(a, 1, constant_values=nothing)
-    return grown[1 + dv : 1 + dv + a.shape[0], 1 + du : 1 + du + a.shape[1]]
-
-
 def cells_of(
     depth: Float[np.ndarray, "H W"],
     label: Int[np.ndarray, "H W"],
-    kinds: _Pixels,
+    kinds: PixelKinds,
     image: ScoredImage,
     errors: SharedErrorImage,
 ) -> SurfaceCells:
@@ -257,9 +176,9 @@ def log_edges(
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
     of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
     window = []
-    for dv, du in _around():
-        y = _shifted(depth, dv, du, np.inf)[v, u]
-        there = _shifted(label, dv, du, NOTHING)[v, u]
+    for dv, du in around():
+        y = shifted(depth, dv, du, np.inf)[v, u]
+        there = shifted(label, dv, du, NOTHING)[v, u]
         surface = np.isfinite(y)
         y0 = np.where(surface, y, 0)
         ex, ey = du / float(image.focal[0]), dv / float(image.focal[1])
@@ -301,20 +220,6 @@ def log_unknown(
 def lost_density(errors: SharedErrorImage) -> float:
     """Of returns near outlines that lie anywhere, per metre."""
     return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH
-
-
-def mask_nats(unknown: Bool[np.ndarray, "H W"], of_object: Bool[np.ndarray, "H W"], image: ScoredImage) -> float:
-    """Of the outlines of what is unknown: prior's nats, negative. of_object: returns that depth should not go on to."""
-    observed = np.asarray(image.depth, np.float64)
-    inside = (np.asarray(image.pixel_class) == IN_WORKSPACE) & (np.arange(len(observed))[:, None] < image.own_rows)
-    total = 0.0
-    for axis in (0, 1):
-        one, other = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        sides = inside[one] & inside[other] & (unknown[one] != unknown[other])
-        known = np.where(unknown[one], of_object[other], of_object[one])
-        seam = sides & known & (np.abs(observed[one] - observed[other]) < SEAM_DEPTH)
-        total -= OUTLINE_NATS * sides.sum() + SEAM_NATS * seam.sum()
-    return total
 
 
 def log_object(

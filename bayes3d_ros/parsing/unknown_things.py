@@ -26,7 +26,7 @@ from scipy.special import expit
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.likelihood.shared_errors import OUTLINE_NATS
-from bayes3d_ros.likelihood.slow_shared_errors import NOTHING, OBJECT, TABLE, stands_in_front
+from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, stands_in_front
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
 from bayes3d_ros.parsing.support_plane import connected_pieces

@@ -169,8 +169,8 @@ def _log_of_shares(sums):
 @strict
 def _priors(scale, amplitudes):
     """Variances of an object's bias and slopes; 0 where it has no shared error."""
-    bias2, wave2 = (scale * amplitudes[0]) ** 2, (scale * amplitudes[1]) ** 2
-    slope2 = wave2 / (amplitudes[2] * amplitudes[2]) + (scale * amplitudes[7]) ** 2
+    bias2, wave2 = (scale * amplitudes.bias) ** 2, (scale * amplitudes.wave) ** 2
+    slope2 = wave2 / (amplitudes.length * amplitudes.length) + (scale * amplitudes.lean) ** 2
     if bias2 + slope2 == 0:
         return 0.0, 0.0
     return max(bias2 + wave2, 1e-12), max(slope2, 1e-12)
@@ -186,7 +186,7 @@ def _add_priors(sums, level, slope):
 @strict
 def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
     """The mode of an object's shared error at one node, by reweighted steps, into a: bias (m), slopes along x and y."""
-    variance, share = f32((scale * amplitudes[3]) ** 2), amplitudes[4]
+    variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
     level, slope = _priors(scale, amplitudes)
     a[0], a[1], a[2] = 0.0, 0.0, 0.0
     if level == 0:
@@ -201,7 +201,7 @@ def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
 def log_object(cells, s, most, count, scale, amplitudes, sums, a):
     """log density of the cells of one object at one node, relative to `reference_height`: its shared error integrated
     out by a paraboloid about a, which is near the mode."""
-    variance, share = f32((scale * amplitudes[3]) ** 2), amplitudes[4]
+    variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
     level, slope = _priors(scale, amplitudes)
     _pass(cells, s, most, count, a, variance, share, sums)
     value = _log_of_shares(sums)

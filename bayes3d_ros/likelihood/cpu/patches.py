@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The part of an image that a hypothesis changes, pixel by pixel: what each return is scored as, and what those that
-belong to no cell say. The densities are those of `likelihood/slow_shared_errors.py`."""
+"""The part of an image that a hypothesis changes, pixel by pixel: what each return is scored as. The kinds are those of
+`likelihood/slow_pixel_kinds.py`."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,10 @@ from jaxtyping import Float, Int
 from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, fill, i32, u8, u64
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
 from bayes3d_ros.likelihood.cpu.packing import lesser
-from bayes3d_ros.likelihood.cpu.windows import exp, log, windows_with
-from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, LATERAL
+from bayes3d_ros.likelihood.cpu.windows import windows_with
+from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
-    LOST_DEPTH,
-    LOST_SHARE,
     OUTLINE_NATS,
     SEAM_DEPTH,
     SEAM_NATS,
@@ -26,7 +24,6 @@ from bayes3d_ros.likelihood.shared_errors import (
 NOTHING, TABLE, OLD, NEW = 0, 1, 2, 3  # labels: the objects that were there before are one
 NOT_SCORED, UNKNOWN, EDGE, CELL, HIDDEN = 0, 1, 2, 3, 4  # kinds
 _BEHIND, _GOES_ON = 5, 6  # while kinds are found: in front of their own surface, behind an object of their window
-_SLOTS = 16  # of the points in a window: whole vectors
 _NO_OBJECT = 1e6  # metres, to no object
 
 
@@ -185,11 +182,10 @@ def sort_scene(picture, space, patch, scene, changed, stride, size, border):
     # The border has no flags: what is there belongs to the last patch, or to the end of another row.
     for k in range(first):
         patch.several[k], patch.several[size - 1 - k] = u8(0), u8(0)
+        scene.kind[k], scene.kind[size - 1 - k] = u8(NOT_SCORED), u8(NOT_SCORED)
     for k in range(0, size, stride):
         for b in range(border):
             patch.several[k + b], patch.several[k + stride - 1 - b] = u8(0), u8(0)
-    for k in range(first):
-        scene.kind[k], scene.kind[size - 1 - k] = u8(NOT_SCORED), u8(NOT_SCORED)
     if _find_kinds(space, scene, patch, picture.front_margin, first, last) != 0:
         _go_on(space, patch, scene, stride, size, border)
     windows_with(patch.several, size, stride, border, space.wider, scene.near_outline)
@@ -236,83 +232,3 @@ def gather_rows(changes, at, stride, rows, count, found):
     for row in range(u64(rows)):
         for u in range(u64(count)):
             found[u] |= changes[at + row * stride + u]
-
-
-@strict
-def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes, window, values):
-    """log density of the return of an edge pixel at every pair of noise, into values. window: 4 rows of numbers to
-    work in, and 3: weights of what is 0, 1 and 2 squared pixels farther away than the nearest."""
-    sigma, p_outlier, table, _, amplitudes = nodes
-    row, column = k // stride, k - k // stride * stride
-    x, y = picture.ray_x[column + left], picture.ray_y[row + top]
-    z = space.depth[k]
-    norm2 = f32(1.0) + x * x + y * y
-    outlier = picture.outlier_scale * z * z
-    spread = returns.spread[(row + top) * returns.columns + column + left]
-    of_object = amplitudes[0] * amplitudes[0] + amplitudes[1] * amplitudes[1] + amplitudes[3] * amplitudes[3]
-    of_table = table[len(table) // 2] * table[len(table) // 2]
-    step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
-    offs, owns, acrosses, weights = window[0], window[1], window[2], window[3]
-    nearest, least, count = f32(1e30), 9, 0
-    front, back, of_objects = f32(NO_SURFACE_METRES), f32(0.0), False
-    for dv in range(-1, 2):
-        for du in range(-1, 2):
-            d = depth[k + dv * stride + du]
-            if d < f32(NO_SURFACE_METRES):
-                ex, ey = f32(du) * step_x, f32(dv) * step_y
-                turned = ex * y - ey * x
-                across = d * d * (ex * ex + ey * ey + turned * turned) / norm2
-                nearest, least = min(nearest, across), min(least, du * du + dv * dv)
-                on_table = label[k + dv * stride + du] == TABLE
-                of_objects |= not on_table
-                offs[count] = z - d * (f32(1.0) + (ex * x + ey * y) / norm2)
-                owns[count] = of_table if on_table else f32(of_object)
-                acrosses[count], weights[count] = across, f32(du * du + dv * dv)
-                front, back = min(front, d), max(back, d)
-                count += 1
-    blur, bad, share = f32(amplitudes[6]), f32(amplitudes[4]), f32(amplitudes[5])
-    dented = f32(1 / BAD_DEPTH) if (z < front) & (z > front - f32(BAD_DEPTH)) else f32(0.0)
-    lost = f32(LOST_SHARE / LOST_DEPTH) * share
-    if blur > 0:
-        for c in range(count):
-            weights[c] = window[4][i32(weights[c]) - least]
-        for c in range(count, _SLOTS):
-            weights[c] = f32(0.0)
-    for s in range(len(sigma)):
-        p, noise = p_outlier[s], sigma[s] * spread
-        if count == 0:
-            values[s] = log(p * outlier + (f32(1.0) - p) * outlier)
-            continue
-        if blur <= 0:
-            for c in range(count):
-                weights[c] = exp(f32(-0.5) * (acrosses[c] - nearest) / (noise * noise)) + f32(LATERAL)
-            for c in range(count, _SLOTS):
-                weights[c] = f32(0.0)
-        mixture = _mixture(weights, offs, owns, noise * noise / norm2)
-        if of_objects:
-            mixture = (f32(1.0) - bad) * mixture + bad * dented
-        behind = max(back, front + f32(4.0) * noise)
-        between = f32(1.0) / (behind - front) if front < z < behind else f32(0.0)
-        inside = (f32(1.0) - share) * mixture + share * between
-        values[s] = log(p * outlier + lost + (f32(1.0) - p) * inside)
-
-
-@fast
-def _mixture(weights, offs, owns, noise2):
-    """The mean of normal densities at `offs`, of variances `noise2` + `owns`, all slots side by side."""
-    total, all_weights = f32(0.0), f32(0.0)
-    for c in range(u64(_SLOTS)):
-        precision = f32(1.0) / (noise2 + owns[c])
-        density = exp(f32(-0.5) * offs[c] * offs[c] * precision) * np.sqrt(precision * f32(1 / (2 * np.pi)))
-        total += weights[c] * density
-        all_weights += weights[c]
-    return total / all_weights
-
-
-@allocating
-def new_window(blur):
-    """What `log_edge` works in."""
-    window = np.ones((5, _SLOTS), np.float32)
-    for k in range(3):
-        window[4, k] = np.exp(f32(-0.5) * f32(k) / (blur * blur)) if blur > 0 else f32(0)
-    return window

@@ -5,17 +5,13 @@ numba compiles, as XLA calls them on CPUs."""
 
 import numpy as np
 
+from bayes3d_ros.likelihood.cpu.block_sums import score_blocks
 from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
-from bayes3d_ros.likelihood.cpu.cells import (
-    CELLS_SIDE_BY_SIDE,
-    NO_MODE,
-    find_modes,
-    new_batch,
-    normal_cells,
-    table_cells,
-)
+from bayes3d_ros.likelihood.cpu.cells import new_batch
 from bayes3d_ros.likelihood.cpu.compiling import handler, strict
+from bayes3d_ros.likelihood.cpu.edges import new_window
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
+from bayes3d_ros.likelihood.cpu.nodes import nodes_of
 from bayes3d_ros.likelihood.cpu.object_cells import (
     begin_object,
     find_shared_error,
@@ -26,174 +22,21 @@ from bayes3d_ros.likelihood.cpu.object_cells import (
 )
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
-    CELL,
-    EDGE,
-    HIDDEN,
-    NEW,
-    OLD,
-    TABLE,
-    UNKNOWN,
     Returns,
     begin_table,
     find_changes,
     gather_rows,
-    log_edge,
     mask_nats,
     new_patch,
     new_scene_pixels,
-    new_window,
     sort_scene,
 )
-from bayes3d_ros.likelihood.cpu.windows import begin_patch, log, mark_changes, windows_with
+from bayes3d_ros.likelihood.cpu.windows import begin_patch, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SEEN_THROUGH
 
 SHARED_GAIN_TARGET = "bayes3d_shared_gain_of_hypotheses"
 REACH = 4  # pixels from one that a hypothesis changes, to which its outlines, and what goes on there, matter
 WARP = 3  # numbers of the shared error of an object: metres at the image's first pixel, a column, a row
-
-
-@strict
-def _median(residual, used, count, ordered):
-    """Of a cell's residuals; `ordered` is worked in: insertion."""
-    for a in range(count):
-        value, b = residual[a * CELLS_SIDE_BY_SIDE + used], a
-        while b > 0 and ordered[b - 1] > value:
-            ordered[b] = ordered[b - 1]
-            b -= 1
-        ordered[b] = value
-    middle = count // 2
-    return ordered[middle] if count % 2 else f32(0.5) * (ordered[middle] + ordered[middle - 1])
-
-
-@strict
-def _labels_of_cells(scene, rectangle, stride, left, top):
-    """A bit for each label that has a cell in a block."""
-    u0, u1, v0, v1 = rectangle
-    bits = 0
-    for v in range(v0, v1):
-        for u in range(u0, u1):
-            k = (v - top) * stride + u - left
-            if scene.kind[k] == CELL:
-                bits |= 1 << scene.label[k]
-    return bits
-
-
-@strict
-def _gather(
-    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
-):
-    """The cell of one label in a block, as the next of the batch."""
-    u0, u1, v0, v1 = rectangle
-    planes, returns_sorted = cell_work
-    slot, w = 0, CELLS_SIDE_BY_SIDE
-    column, row = 0.0, 0.0
-    planes[:] = f32(0)
-    for v in range(v0, v1):
-        for u in range(u0, u1):
-            k = (v - top) * stride + u - left
-            if scene.kind[k] != CELL or scene.label[k] != label:
-                continue
-            x, y, z = picture.ray_x[u], picture.ray_y[v], space.depth[k]
-            spread = returns.spread[v * returns.columns + u]
-            at = slot * w + used
-            precision = (f32(1.0) + x * x + y * y) / (spread * spread)
-            batch.residual[at] = z - scene.depth[k]
-            batch.precision[at] = precision
-            batch.root[at] = np.sqrt(precision * f32(1 / (2 * np.pi)))
-            batch.outlier[at] = picture.outlier_scale * z * z
-            batch.lost[at] = lost if scene.near_outline[k] != 0 else f32(0.0)
-            for s in range(len(planes) if label != TABLE else 0):
-                planes[s] += returns.own_plane[(s * returns.rows + v) * returns.columns + u]
-            column, row = column + u, row + v
-            slot += 1
-    count = slot
-    median = _median(batch.residual, used, count, returns_sorted)
-    batch.start[used] = median
-    near = (median > f32(-BAD_DEPTH)) & (median < f32(SEEN_THROUGH)) & (label != TABLE)
-    for s in range(len(batch.own_plane) // w):
-        batch.own_plane[s * w + used] = planes[s] if near else NO_MODE
-    batch.label[used], batch.place_of_sum[used] = label, place_of_sum
-    batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
-
-
-@strict
-def _clear(batch, returns):
-    w = CELLS_SIDE_BY_SIDE
-    for k in range(returns * w):
-        batch.residual[k], batch.precision[k], batch.root[k], batch.outlier[k] = f32(0), f32(1), f32(0), f32(1)
-        batch.lost[k] = f32(0)
-    for c in range(w):
-        batch.start[c], batch.label[c], batch.place_of_sum[c] = f32(0), 0, 0
-
-
-@strict
-def _add_cells(batch, used, label, sums, column):
-    """The batch's values, of cells of one label, to the rows of sums that they belong to."""
-    for c in range(used):
-        if batch.label[c] == label:
-            sums[batch.place_of_sum[c], column] += batch.value[c]
-
-
-@strict
-def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
-    """The batch's cells into sums; those of the new object are kept. Returns how many these are now."""
-    sigma, p_outlier, table, scale, amplitudes = nodes
-    w, tables, scales = CELLS_SIDE_BY_SIDE, len(table), len(scale)
-    of_table, of_old, of_new = 0, 0, 0
-    for c in range(used):
-        of_table += 1 if batch.label[c] == TABLE else 0
-        of_old += 1 if batch.label[c] == OLD else 0
-        of_new += 1 if batch.label[c] == NEW else 0
-    for s in range(len(sigma)):
-        find_modes(batch, returns, sigma[s], p_outlier[s], s == 0)
-        for t in range(tables if of_table > 0 else 0):
-            table_cells(batch, table[t] * table[t])
-            _add_cells(batch, used, TABLE, fixed, s * tables + t)
-        for a in range(scales if of_old > 0 else 0):
-            normal_cells(batch, s, f32((scale[a] * amplitudes[3]) ** 2), amplitudes[4])
-            _add_cells(batch, used, OLD, old, s * scales + a)
-        kept = new_cells
-        for c in range(used if of_new > 0 else 0):
-            if batch.label[c] != NEW:
-                continue
-            for which in range(2):
-                at = 2 * s * most + which * most + kept
-                own.height[at] = batch.height[which * w + c]
-                own.place[at] = batch.place[which * w + c]
-                own.curvature[at] = batch.curvature[which * w + c]
-            own.outliers[s * most + kept] = batch.outliers[c]
-            own.bad[s * most + kept] = batch.own_plane[s * w + c]
-            own.column[kept], own.row[kept], own.number[kept] = batch.column[c], batch.row[c], batch.number[c]
-            kept += 1
-    return new_cells + of_new
-
-
-@strict
-def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
-    """What returns that belong to no cell say, added to sums."""
-    sigma, p_outlier, table, _, amplitudes = nodes
-    window, values = work
-    u0, u1, v0, v1 = rectangle
-    tables = len(table)
-    for v in range(v0, v1):
-        for u in range(u0, u1):
-            k = (v - top) * stride + u - left
-            kind = scene.kind[k]
-            if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
-                continue
-            if kind == EDGE:
-                log_edge(picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, window, values)
-            for s in range(len(sigma)):
-                if kind == UNKNOWN and amplitudes[8] > 0:
-                    values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
-                elif kind == UNKNOWN:
-                    values[s] = log(p_outlier[s] * picture.outlier_scale * space.depth[k] * space.depth[k])
-                elif kind == HIDDEN:
-                    lost = f32(LOST_SHARE) * amplitudes[5] if scene.near_outline[k] != 0 else f32(0.0)
-                    values[s] = log(p_outlier[s] + lost)
-                for t in range(tables):
-                    sums[s * tables + t] += values[s]
 
 
 @strict
@@ -211,38 +54,6 @@ def _find_touched(changes, rectangle, block, stride, left, top, across, row, tou
                 touched[count] = v // block * across + u // block
                 count += 1
     return count
-
-
-@strict
-def _score_blocks(
-    picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
-    one_row,
-):  # fmt: skip
-    """What blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how many cells of
-    the new object were kept."""
-    height, width = len(picture.ray_y), len(picture.ray_x)
-    across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
-    lost = f32(LOST_SHARE / LOST_DEPTH) * nodes[4][5]
-    used, new_cells = 0, 0
-    _clear(batch, returns_a_cell)
-    for number in blocks:
-        v, u = number // across * block, number % across * block
-        here = (u, min(u + block, width), v, min(v + block, height))
-        place = 0 if one_row else number
-        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, work, fixed[place])
-        here_labels = _labels_of_cells(scene, here, stride, left, top)
-        for label in range(TABLE, NEW + 1):
-            if here_labels >> label & 1 == 0:
-                continue
-            _gather(picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work)
-            used += 1
-            if used == CELLS_SIDE_BY_SIDE:
-                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
-                used = 0
-                _clear(batch, returns_a_cell)
-    if used > 0:
-        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
-    return new_cells
 
 
 @strict
@@ -272,14 +83,14 @@ def _gain_of(
     sort_scene(picture, space, patch, former, patch.nowhere, stride, size, border)
     first, last = border * stride + border, size - border * stride - border
     mask = 0.0
-    if amplitudes[8] > 0:  # there are unknown things
+    if amplitudes.unknown > 0:  # there are unknown things
         mask = mask_nats(space, now, first, last, stride)
         mask -= mask_nats(space, former, first, last, stride)
     across = (width + block - 1) // block
     metres, pixels = find_changes(space, now, former, first, last, patch.changes)
     count = _find_touched(patch.changes, (u0, u1, v0, v1), block, stride, left, top, across, patch.row, touched)
     fixed[0, :], old[0, :] = mask, 0.0
-    new_cells = _score_blocks(
+    new_cells = score_blocks(
         picture, returns, space, now, touched[:count], block, stride, left, top, nodes, pixel_work, cell_work, batch,
         own, fixed, old, True,
     )  # fmt: skip
@@ -290,10 +101,11 @@ def _gain_of(
             known[touched[k]] = 1
             touched[count + fresh] = touched[k]
             fresh += 1
-    _score_blocks(
-        picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
-        pixel_work, cell_work, batch, own, former_fixed, former_old, False,
-    )  # fmt: skip
+    if fresh > 0:
+        score_blocks(
+            picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
+            pixel_work, cell_work, batch, own, former_fixed, former_old, False,
+        )  # fmt: skip
     for k in range(count):
         for level in range(fixed.shape[1]):
             fixed[0, level] -= former_fixed[touched[k], level]
@@ -304,7 +116,7 @@ def _gain_of(
     if new_cells > 0:
         column, row = place_cells(own, new_cells, metres)
         for s in range(len(sigma)):
-            begin_object(own, s, most, new_cells, amplitudes[4])
+            begin_object(own, s, most, new_cells, amplitudes.bad_share)
         # One paraboloid for all nodes: about the mode at the middle one.
         find_shared_error(own, len(sigma) // 2, most, new_cells, scale[scales // 2], amplitudes, sums, error)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
@@ -337,20 +149,20 @@ def _shared_gain(frame):
         floats(frame, 17), floats(frame, 18), floats(frame, 19), floats(frame, 20), len(floats(frame, 13)),
         len(picture.ray_x),
     )  # fmt: skip
-    nodes = (floats(frame, 21), floats(frame, 22), floats(frame, 23), floats(frame, 24), floats(frame, 25))
+    nodes = nodes_of(frame, 21)
     scenes, ancestor = floats(frame, 15), integers(frame, 16)
     gain, warp = float_results(frame, 0), float_results(frame, 1)
     count, objects = len(planes) // 4, objects_each(things, planes)
     height, width = len(picture.ray_y), len(picture.ray_x)
     space = new_space(height, width, 1, objects, most_corners(things))
-    pairs, tables, scales = len(nodes[0]), len(nodes[2]), len(nodes[3])
+    pairs, tables, scales = len(nodes.sigma), len(nodes.table), len(nodes.scale)
     patch, batch = new_patch(len(space.patch)), new_batch(block * block, pairs)
     now, former = new_scene_pixels(space.patch), new_scene_pixels(space.before)
     blocks = (height // block + 1) * (width // block + 1)
     own = new_object_cells(pairs, blocks)
     work = (
         np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
-        (new_window(nodes[4][6]), np.zeros(pairs, np.float32)),
+        (new_window(nodes.amplitudes.edge_blur), np.zeros(pairs, np.float32)),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
     )  # fmt: skip
     former_sums = (

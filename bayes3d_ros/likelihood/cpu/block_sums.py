@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the blocks of a patch say of a scene, at every node: cells of the table and of objects that were there before
+as sums, and the cells of the new object one by one."""
+
+import numpy as np
+
+from bayes3d_ros.likelihood.cpu.buffers import f32
+from bayes3d_ros.likelihood.cpu.cells import CELLS_SIDE_BY_SIDE, NO_MODE, find_modes, normal_cells, table_cells
+from bayes3d_ros.likelihood.cpu.compiling import strict
+from bayes3d_ros.likelihood.cpu.edges import log_edge
+from bayes3d_ros.likelihood.cpu.patches import CELL, EDGE, HIDDEN, NEW, OLD, TABLE, UNKNOWN
+from bayes3d_ros.likelihood.cpu.windows import log
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SEEN_THROUGH
+
+
+@strict
+def _median(residual, used, count, ordered):
+    """Of a cell's residuals; `ordered` is worked in: insertion."""
+    for a in range(count):
+        value, b = residual[a * CELLS_SIDE_BY_SIDE + used], a
+        while b > 0 and ordered[b - 1] > value:
+            ordered[b] = ordered[b - 1]
+            b -= 1
+        ordered[b] = value
+    middle = count // 2
+    return ordered[middle] if count % 2 else f32(0.5) * (ordered[middle] + ordered[middle - 1])
+
+
+@strict
+def _labels_of_cells(scene, rectangle, stride, left, top):
+    """A bit for each label that has a cell in a block."""
+    u0, u1, v0, v1 = rectangle
+    bits = 0
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            k = (v - top) * stride + u - left
+            if scene.kind[k] == CELL:
+                bits |= 1 << scene.label[k]
+    return bits
+
+
+@strict
+def _gather(
+    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
+):
+    """The cell of one label in a block, as the next of the batch."""
+    u0, u1, v0, v1 = rectangle
+    planes, returns_sorted = cell_work
+    count, w = 0, CELLS_SIDE_BY_SIDE
+    column, row = 0.0, 0.0
+    planes[:] = f32(0)
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            k = (v - top) * stride + u - left
+            if scene.kind[k] != CELL or scene.label[k] != label:
+                continue
+            x, y, z = picture.ray_x[u], picture.ray_y[v], space.depth[k]
+            spread = returns.spread[v * returns.columns + u]
+            at = count * w + used
+            precision = (f32(1.0) + x * x + y * y) / (spread * spread)
+            batch.residual[at] = z - scene.depth[k]
+            batch.precision[at] = precision
+            batch.root[at] = np.sqrt(precision * f32(1 / (2 * np.pi)))
+            batch.outlier[at] = picture.outlier_scale * z * z
+            batch.lost[at] = lost if scene.near_outline[k] != 0 else f32(0.0)
+            for s in range(len(planes) if label != TABLE else 0):
+                planes[s] += returns.own_plane[(s * returns.rows + v) * returns.columns + u]
+            column, row = column + u, row + v
+            count += 1
+    median = _median(batch.residual, used, count, returns_sorted)
+    batch.start[used] = median
+    near = (median > f32(-BAD_DEPTH)) & (median < f32(SEEN_THROUGH)) & (label != TABLE)
+    for s in range(len(batch.own_plane) // w):
+        batch.own_plane[s * w + used] = planes[s] if near else NO_MODE
+    batch.label[used], batch.place_of_sum[used] = label, place_of_sum
+    batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
+
+
+@strict
+def _clear(batch, returns):
+    w = CELLS_SIDE_BY_SIDE
+    for k in range(returns * w):
+        batch.residual[k], batch.precision[k], batch.root[k], batch.outlier[k] = f32(0), f32(1), f32(0), f32(1)
+        batch.lost[k] = f32(0)
+    for c in range(w):
+        batch.start[c], batch.label[c], batch.place_of_sum[c] = f32(0), 0, 0
+
+
+@strict
+def _add_cells(batch, used, label, sums, column):
+    """The batch's values, of cells of one label, to the rows of sums that they belong to."""
+    for c in range(used):
+        if batch.label[c] == label:
+            sums[batch.place_of_sum[c], column] += batch.value[c]
+
+
+@strict
+def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
+    """The batch's cells into sums; those of the new object are kept. Returns how many these are now."""
+    sigma, p_outlier, table, scale, amplitudes = nodes
+    w, tables, scales = CELLS_SIDE_BY_SIDE, len(table), len(scale)
+    of_table, of_old, of_new = 0, 0, 0
+    for c in range(used):
+        of_table += 1 if batch.label[c] == TABLE else 0
+        of_old += 1 if batch.label[c] == OLD else 0
+        of_new += 1 if batch.label[c] == NEW else 0
+    for s in range(len(sigma)):
+        find_modes(batch, returns, sigma[s], p_outlier[s], s == 0)
+        for t in range(tables if of_table > 0 else 0):
+            table_cells(batch, table[t] * table[t])
+            _add_cells(batch, used, TABLE, fixed, s * tables + t)
+        for a in range(scales if of_old > 0 else 0):
+            normal_cells(batch, s, f32((scale[a] * amplitudes.model) ** 2), amplitudes.bad_share)
+            _add_cells(batch, used, OLD, old, s * scales + a)
+        kept = new_cells
+        for c in range(used if of_new > 0 else 0):
+            if batch.label[c] != NEW:
+                continue
+            for which in range(2):
+                at = 2 * s * most + which * most + kept
+                own.height[at] = batch.height[which * w + c]
+                own.place[at] = batch.place[which * w + c]
+                own.curvature[at] = batch.curvature[which * w + c]
+            own.outliers[s * most + kept] = batch.outliers[c]
+            own.bad[s * most + kept] = batch.own_plane[s * w + c]
+            own.column[kept], own.row[kept], own.number[kept] = batch.column[c], batch.row[c], batch.number[c]
+            kept += 1
+    return new_cells + of_new
+
+
+@strict
+def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
+    """What returns that belong to no cell say, added to sums."""
+    sigma, p_outlier, table, _, amplitudes = nodes
+    window, values = work
+    u0, u1, v0, v1 = rectangle
+    tables = len(table)
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            k = (v - top) * stride + u - left
+            kind = scene.kind[k]
+            if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
+                continue
+            if kind == EDGE:
+                log_edge(picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, window, values)
+            for s in range(len(sigma)):
+                if kind == UNKNOWN and amplitudes.unknown > 0:
+                    values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
+                elif kind == UNKNOWN:
+                    values[s] = log(p_outlier[s] * picture.outlier_scale * space.depth[k] * space.depth[k])
+                elif kind == HIDDEN:
+                    lost = f32(LOST_SHARE) * amplitudes.edge_share if scene.near_outline[k] != 0 else f32(0.0)
+                    values[s] = log(p_outlier[s] + lost)
+                for t in range(tables):
+                    sums[s * tables + t] += values[s]
+
+
+@strict
+def score_blocks(
+    picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
+    one_row,
+):  # fmt: skip
+    """What blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how many cells of
+    the new object were kept."""
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
+    lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
+    used, new_cells = 0, 0
+    _clear(batch, returns_a_cell)
+    for number in blocks:
+        v, u = number // across * block, number % across * block
+        here = (u, min(u + block, width), v, min(v + block, height))
+        place = 0 if one_row else number
+        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, work, fixed[place])
+        here_labels = _labels_of_cells(scene, here, stride, left, top)
+        for label in range(TABLE, NEW + 1):
+            if here_labels >> label & 1 == 0:
+                continue
+            _gather(picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work)
+            used += 1
+            if used == CELLS_SIDE_BY_SIDE:
+                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+                used = 0
+                _clear(batch, returns_a_cell)
+    if used > 0:
+        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+    return new_cells
