@@ -12,7 +12,7 @@ from bayes3d_ros.likelihood.cpu.xla_ffi import floats
 from bayes3d_ros.likelihood.shared_errors import Amplitudes
 
 
-class Nodes(NamedTuple):
+class NodeArrays(NamedTuple):
     """Where the errors' parameters are summed over, and the amplitudes at the middle node."""
 
     sigma: Float[np.ndarray, "S"]  # metres
@@ -27,6 +27,6 @@ def nodes_of(frame, first):
     """From a target's arguments: this one and the four after it."""
     a = floats(frame, first + 4)
     amplitudes = Amplitudes(a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8])
-    return Nodes(
+    return NodeArrays(
         floats(frame, first), floats(frame, first + 1), floats(frame, first + 2), floats(frame, first + 3), amplitudes
     )
