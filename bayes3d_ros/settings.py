@@ -126,7 +126,7 @@ class ParserSettings:
         high=0.9,
     )
     edge_share: float = setting(
-        0.3, "share of returns at the edges of surfaces that lie anywhere between them", low=0.0, high=0.9
+        0.1, "share of returns at the edges of surfaces that lie anywhere between them", low=0.0, high=0.9
     )
     edge_blur: float = setting(
         0.7,
@@ -136,12 +136,11 @@ class ParserSettings:
         high=3.0,
     )
     outline_sigma: float = setting(
-        0.0008,
-        "standard deviation by which the camera shows an object's outline larger, displaced along either axis of the "
-        "image, and turned; seen from the camera (a scored pixel is some 0.006)",
-        unit="rad",
+        0.13,
+        "standard deviation by which an object's whole picture, its outline, stands beside the object",
+        unit="scored px",
         low=0.0,
-        high=0.02,
+        high=3.0,
     )
     image_bias: float = setting(
         0.001, "standard deviation of depth errors that the whole image shares", unit="m", low=0.0, high=0.05
@@ -185,7 +184,7 @@ class ParserSettings:
     def shares_errors(self) -> bool:
         """Whether neighbouring pixels share errors: with every amplitude zero, `depth` is `independent`."""
         surface = (self.surface_bias, self.surface_waves, self.model_error, self.object_lean, self.bad_share)
-        amplitudes = (*surface, self.edge_share, self.edge_blur, self.outline_sigma)
+        amplitudes = (*surface, self.edge_share, self.edge_blur)
         return self.likelihood == "depth" and any(amplitudes)
 
 

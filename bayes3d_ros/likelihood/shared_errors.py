@@ -15,14 +15,10 @@ own, as blocks of unknown things are (`own_plane.py`), whose median residual is 
 depth error that the whole object shares, with phi = (1, x, y), metres from the middle of what is seen of it; the
 variance of its slopes also holds lean^2, as nothing stands upright to the degree.
 
-A pixel whose window shows several surfaces is an edge, and belongs to no cell. Its return is of one of them, as likely
-as a blur of the image says (outlines of depth images are off by a part of a pixel), where that surface goes on at the
-pixel's own ray, moved and as uncertain as the cell of that surface in the block; with a share for returns from
-`EDGE_MARGIN` before the window's front to as much behind its back, and, with probability pi, of the `BAD_DEPTH` in
-front of an object. The outline of an object as the camera shows it is larger or smaller than the object's, displaced
-along either axis of the image, and turned: four errors that all its edge pixels share, each normal (the turn as its
-mean corner moves). A pixel's log density is followed along the outline's normal to second order, so their integral is
-that of a paraboloid.
+A pixel whose window shows several surfaces is an edge, and belongs to no cell: the mixture of `density.py`, with each
+point as wide as its surface's errors make it and as likely as a blur of the image says (outlines of depth images are
+off by a part of a pixel, and alike along an object), with a share for returns between the window's front and back, and,
+with probability pi, of the `BAD_DEPTH` in front of an object.
 
 Within two pixels of an outline a return may also lie anywhere (density `LOST_SHARE` edge_share / `LOST_DEPTH`; beyond
 the workspace: probability `LOST_SHARE` edge_share): cameras blur outlines, and lose thin parts. Nothing else excuses a
@@ -33,9 +29,8 @@ unknown (`own_plane.py`); so does one beside it at which its depth goes on, behi
 unknown things have the prior exp(-`OUTLINE_NATS` L), L their length in pixels' sides, and another `SEAM_NATS` for each
 side at which depth goes on from the unknown thing to returns of a known one: things end where depth jumps.
 
-sigma, p_out, the table's tau and a scale of all amplitudes of objects' surfaces are integrated over nodes
-(`ErrorNodes`), jointly with the scene; so is a scale of each object's outline's errors, which is its own. Blocks depend
-on the image alone.
+sigma, p_out, the table's tau and a scale of all amplitudes of objects are integrated over nodes (`ErrorNodes`), jointly
+with the scene. Blocks depend on the image alone.
 """
 
 from typing import NamedTuple
@@ -55,27 +50,21 @@ SEAM_NATS = 5.0  # a side
 SEAM_DEPTH = 0.01  # metres between neighbouring returns over which depth goes on
 TABLE_MARGIN = 0.008  # metres in front of the table from which a return belongs to something else, or
 TABLE_MARGIN_SDS = 5.0  # so many standard deviations of a return
-SHARPEST_BEND = (
-    3.0  # change of slope (metres of depth a metre across): windows with sharper bends show several surfaces
-)
-STEEPEST = 10.0  # metres of depth a metre across, by which a surface is followed to the ray of an edge pixel
-EDGE_MARGIN = 0.005  # metres in front of and behind the surfaces of an edge, to which returns between them may lie
-LOST_SHARE, LOST_DEPTH = 0.17, 0.3  # of `edge_share`; metres over which such returns are spread
+STEEPEST = 3.0  # metres of depth a metre across: a window that is steeper shows several surfaces
+LOST_SHARE, LOST_DEPTH = 0.5, 0.3  # of `edge_share`; metres over which such returns are spread
 BLOCK_SIDE = 0.015  # metres at the image's median depth
 LEAST_BLOCK = 2  # pixels
 # Of a Beta distribution with the mean of `bad_share`: quantiles and weights stand for it (three, as of an object).
 BAD_SPREAD = (0.35, 1.0, 2.5)
 BAD_WEIGHT = (0.3, 0.5, 0.2)
-OUTLINE_STEP = 0.3  # pixels along its normal over which slopes and bends of an edge pixel's log density are taken
-FARTHEST_OUTLINE = 4.0  # standard deviations of an outline's error, beyond which a paraboloid says nothing
 # How a cell's modes, and an object's shared error, are followed
 MODE_STEPS, MORE_MODE_STEPS, REWEIGHTED_STEPS = 5, 2, 3  # more: at the other pairs of noise
 FEWEST_INLIERS = 0.5  # returns, of a mode
 SAME_MODE_SDS = 0.5  # standard deviations within which two modes are one
-# Scales of objects' amplitudes: log normal, at the nodes of Gauss and Hermite.
+# Scales of all amplitudes of objects: log normal, at the nodes of Gauss and Hermite.
 AMPLITUDE_LOG_SD = 0.6
 _SIGMA_NODES = (-0.8, 0.8)
-HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
+_HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
 _TABLE_SCALES = (0.6, 1.0, 1.7)
 
 
@@ -90,7 +79,6 @@ class Amplitudes(NamedTuple):
     edge_share: Float[Array, ""] | np.float32  # of returns at edges between the surfaces
     edge_blur: Float[Array, ""] | np.float32  # pixels
     lean: Float[Array, ""] | np.float32  # metres a metre, of an object against how its model rests
-    outline: Float[Array, ""] | np.float32  # radians, of an object's outline: grown, displaced, turned
     unknown: Array | np.bool_ = np.True_  # whether there are unknown things; else what stands in front is an outlier
 
 
@@ -167,7 +155,7 @@ def _nodes(image, spread, inside, block: int, amplitudes: Amplitudes, sigma_max:
     tables = table * np.array(_TABLE_SCALES)
     wave = max(float(amplitudes.wave), 1e-9)
     log_table = -0.5 * (np.log(np.maximum(tables, 1e-9) / wave) / AMPLITUDE_LOG_SD) ** 2 - np.log(len(tables))
-    places, weights = HERMITE
+    places, weights = _HERMITE
     log_weight = log_noise[:, None] + (log_table[:, None] + np.log(weights)).ravel()
     return ErrorNodes(
         sigma.astype(np.float32),

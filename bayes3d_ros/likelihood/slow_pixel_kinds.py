@@ -16,7 +16,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     OUTLINE_NATS,
     SEAM_DEPTH,
     SEAM_NATS,
-    SHARPEST_BEND,
+    STEEPEST,
     SharedErrorImage,
 )
 
@@ -50,9 +50,8 @@ def kinds_of_pixels(
         z, there = shifted(depth, dv, du, np.inf), shifted(label, dv, du, NOTHING)
         apart = max(abs(dv) / float(image.focal[1]), abs(du) / float(image.focal[0]))
         with np.errstate(invalid="ignore"):
-            bend = np.abs(z + shifted(depth, -dv, -du, np.inf) - 2 * depth)
-            bent = np.isfinite(bend) & (bend > SHARPEST_BEND * apart * depth)
-        several = several | ((there != NOTHING) & ((there != label) | bent))
+            steep = np.abs(z - depth) > STEEPEST * apart * depth
+        several = several | ((there != NOTHING) & ((there != label) | steep))
     scored = inside & ~unknown
     hidden = (pixel_class == BEYOND) & rows & (depth < observed + float(image.front_margin))
     near = ndimage.binary_dilation(several & rows, np.ones((3, 3)))

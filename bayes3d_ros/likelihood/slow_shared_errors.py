@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import logsumexp
 
+from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
     BAD_SPREAD,
     BAD_WEIGHT,
     FEWEST_INLIERS,
+    LOST_DEPTH,
     LOST_SHARE,
     MODE_STEPS,
     MORE_MODE_STEPS,
@@ -23,19 +25,15 @@ from bayes3d_ros.likelihood.shared_errors import (
     SEEN_THROUGH,
     SharedErrorImage,
 )
-from bayes3d_ros.likelihood.slow_edges import (
-    SharedPlane,
-    edge_windows,
-    log_edges,
-    log_outlines,
-    lost_density,
-)
 from bayes3d_ros.likelihood.slow_pixel_kinds import (
+    NOTHING,
     OBJECT,
     TABLE,
     PixelKinds,
+    around,
     kinds_of_pixels,
     mask_nats,
+    shifted,
 )
 
 
@@ -72,7 +70,6 @@ class SurfaceCells(NamedTuple):
     real: Bool[np.ndarray, "C K"]
     label: Int[np.ndarray, "C"]
     middle: Float[np.ndarray, "C 2"]  # column and row
-    block: Int[np.ndarray, "C"]  # number of its block of the image
     own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own, -inf where it may have none
 
 
@@ -148,54 +145,66 @@ def cells_of(
     median = np.nanmedian(residual, 1) if len(residual) else np.zeros(0)
     near = (median > -BAD_DEPTH) & (median < SEEN_THROUGH)
     own_plane = np.stack([spread(values).sum(1) for values in errors.own_plane[:, v, u].astype(np.float64)], 1)
-    precision = rays / errors.spread[v, u].astype(np.float64) ** 2
     return SurfaceCells(
         np.nan_to_num(residual),
-        spread(precision, 1.0),
+        spread(rays / errors.spread[v, u].astype(np.float64) ** 2, 1.0),
         spread(float(image.outlier_scale) * observed**2, 1.0),
         spread(np.where(kinds.near_outline[v, u], lost_density(errors), 0.0)),
         real,
         label[v, u][first],
         middle,
-        key[first] % 10**7,
         np.where(near[:, None], own_plane, -np.inf),
     )
 
 
-def cell_offsets(
-    cells: SurfaceCells, found: CellModes, node: int, mean: Float[np.ndarray, "C"], sd: float, share: float
-) -> dict[int, tuple[float, float]]:
-    """By numbers of blocks: mean and variance of a cell's offset, N(mean, sd^2) or, by `share`, bad, as the likeliest
-    of its explanations has it. found: the cells' modes at the node."""
-    with np.errstate(divide="ignore"):
-        good, bad = np.log1p(-share), np.log(share)
-    spread = 1 + found.curvature * sd**2
-    apart = (found.place - mean) ** 2 * found.curvature / spread
-    within = (found.place < 0) & (found.place > -BAD_DEPTH)
-    width = 0.5 * np.log(2 * np.pi / np.maximum(found.curvature, 1e-12)) - np.log(BAD_DEPTH) - np.log(2)
-    own_plane = cells.own_plane[:, node] - np.log(2)
-    values = np.concatenate(
-        [
-            found.outliers[None],
-            bad + own_plane[None],
-            good + found.height - 0.5 * np.log(spread) - 0.5 * apart,
-            bad + np.where(within, found.height + width, -np.inf),
-        ]
-    )
-    uncertain = 1 / np.maximum(found.curvature, 1e-12)
-    higher, each = np.where(found.height[0] >= found.height[1], 0, 1), np.arange(len(mean))
-    means = [mean, found.place[higher, each], *(mean + (1 - 1 / spread) * (found.place - mean)), *found.place]
-    variances = [
-        np.full(len(mean), sd**2),
-        sd**2 + uncertain[higher, each],
-        *(sd**2 / spread),
-        *uncertain,
-    ]
-    best = np.argmax(values, 0)
-    return {
-        int(block): (float(means[k][c]), float(variances[k][c]))
-        for c, (block, k) in enumerate(zip(cells.block, best, strict=True))
-    }
+def log_edges(
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    edge: Bool[np.ndarray, "H W"],
+    image: ScoredImage,
+    errors: SharedErrorImage,
+    node: int,
+) -> Float[np.ndarray, "E"]:
+    """log density of each edge pixel's return."""
+    amplitudes, nodes = errors.amplitudes, errors.nodes
+    sigma, p = float(nodes.sigma[node]), float(nodes.p_outlier[node])
+    v, u = np.nonzero(edge)
+    a, b = np.asarray(image.ray_x, np.float64)[u], np.asarray(image.ray_y, np.float64)[v]
+    observed = np.asarray(image.depth, np.float64)[v, u]
+    norm2, outlier = 1 + a * a + b * b, float(image.outlier_scale) * observed**2
+    noise = sigma * errors.spread[v, u].astype(np.float64)
+    of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
+    of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
+    window = []
+    for dv, du in around():
+        y = shifted(depth, dv, du, np.inf)[v, u]
+        there = shifted(label, dv, du, NOTHING)[v, u]
+        surface = np.isfinite(y)
+        y0 = np.where(surface, y, 0)
+        ex, ey = du / float(image.focal[0]), dv / float(image.focal[1])
+        apart = np.where(surface, du**2 + dv**2, np.inf)
+        across = np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf)
+        variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
+        off = observed - y0 * (1 + (ex * a + ey * b) / norm2)
+        inlier = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
+        window.append((apart, across, inlier, np.where(surface, y0, np.nan), there >= OBJECT))
+    apart, across, inlier, points, of_objects = (np.array(part) for part in zip(*window, strict=True))
+    any_surface = np.isfinite(points).any(0)
+    nearest = np.where(any_surface, across.min(0), 0)
+    blur = float(amplitudes.edge_blur)
+    weight = np.exp(-0.5 * (across - nearest) / noise**2) + LATERAL
+    if blur > 0:
+        weight = np.exp(-0.5 * (apart - np.where(any_surface, apart.min(0), 0)) / blur**2)
+    weight = np.where(np.isfinite(across), weight, 0)
+    mixture = (weight * inlier).sum(0) / np.where(any_surface, weight.sum(0), 1)
+    front = np.nanmin(np.where(any_surface, points, 0.0), 0)
+    back = np.maximum(np.nanmax(np.where(any_surface, points, 0.0), 0), front + 4 * noise)
+    between = np.where((observed > front) & (observed < back), 1 / (back - front), 0.0)
+    dented = of_objects.any(0) & (observed < front) & (observed > front - BAD_DEPTH)
+    share, bad_share = float(amplitudes.edge_share), float(amplitudes.bad_share) * of_objects.any(0)
+    mixture = (1 - bad_share) * mixture + bad_share * dented / BAD_DEPTH
+    inside = np.where(any_surface, (1 - share) * mixture + share * between, outlier)
+    return np.log(p * outlier + np.where(any_surface, lost_density(errors), 0.0) + (1 - p) * inside)
 
 
 def log_unknown(
@@ -208,62 +217,52 @@ def log_unknown(
     return np.log(float(errors.nodes.p_outlier[node]) * outlier)
 
 
-def shared_plane(
-    cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
-) -> SharedPlane:
-    """The mode of an object's shared error by three reweighted steps, and its covariance in the last one. found: the
-    cells' modes at the node; scale: of the cells' own errors."""
-    share, model = float(errors.amplitudes.bad_share), scale * float(errors.amplitudes.model)
-    prior = _plane_variances(1.0, errors)
-    middle = np.average(cells.middle, axis=0, weights=cells.real.sum(1)) if len(cells.middle) else np.zeros(2)
-    plane = SharedPlane(np.zeros(3), np.diag([prior[0], 0, 0]), middle, metres_a_pixel if len(cells.middle) else 0.0)
-    if not len(cells.middle) or not prior.any():
-        return plane
-    phi = plane.basis(*cells.middle.T)
-    bad, a = found.bad(cells.own_plane[:, node]), np.zeros(3)
-    for step in range(REWEIGHTED_STEPS):
-        sd = np.sqrt(model**2 + prior[0]) if step == 0 else model
-        information, pull = _information(found, phi, a, sd, share, bad)
-        covariance = np.linalg.inv(information + np.diag(1 / prior))
-        a = covariance @ pull
-    return plane._replace(mode=a, covariance=covariance)
-
-
-def _plane_variances(scale: float, errors: SharedErrorImage) -> Float[np.ndarray, "3"]:
-    """Of an object's bias and slopes; zeros where it has no shared error."""
-    amplitudes = errors.amplitudes
-    bias2 = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2
-    slope2 = (float(amplitudes.wave) / float(amplitudes.length)) ** 2 + float(amplitudes.lean) ** 2
-    if bias2 + slope2 == 0:
-        return np.zeros(3)
-    return np.maximum(scale**2 * np.array([bias2, slope2, slope2]), 1e-12)
+def lost_density(errors: SharedErrorImage) -> float:
+    """Of returns near outlines that lie anywhere, per metre."""
+    return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH
 
 
 def log_object(
     cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
 ) -> float:
     """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
-    `shared_plane`. found: the cells' modes at the node; scale: of its errors' amplitudes."""
-    share, model = float(errors.amplitudes.bad_share), scale * float(errors.amplitudes.model)
+    three reweighted steps. found: the cells' modes at the node."""
+    amplitudes = errors.amplitudes
+    share, model = float(amplitudes.bad_share), scale * float(amplitudes.model)
     bad = found.bad(cells.own_plane[:, node])
-    plane = shared_plane(cells, found, node, scale, errors, metres_a_pixel)
-    phi, a = plane.basis(*cells.middle.T), plane.mode
 
-    def log_cells(share):
+    def log_cells(a, share, sd=model):
+        mean = phi @ a
         with np.errstate(divide="ignore"):
-            return np.logaddexp(np.log1p(-share) + found.normal(phi @ a, model), np.log(share) + bad)
+            return np.logaddexp(np.log1p(-share) + found.normal(mean, sd), np.log(share) + bad)
 
-    shares = [min(share * b, 0.9) for b in BAD_SPREAD]
-    log_all = logsumexp([log_cells(s).sum() + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
-    prior = _plane_variances(scale, errors)
-    if not prior.any():
-        return log_all
+    def log_all(a):
+        shares = [min(share * b, 0.9) for b in BAD_SPREAD]
+        return logsumexp([log_cells(a, s).sum() + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
+
+    middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
+    phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
+    bias2, wave2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.wave)) ** 2
+    slope2 = wave2 / float(amplitudes.length) ** 2 + (scale * float(amplitudes.lean)) ** 2
+    if bias2 + slope2 == 0:
+        return log_all(np.zeros(3))
+    prior = np.array([bias2 + wave2, slope2, slope2])
+    prior = np.maximum(prior, 1e-12)
+    a = np.zeros(3)
+    for step in range(REWEIGHTED_STEPS):
+        sd = np.sqrt(model**2 + prior[0]) if step == 0 else model
+        information, pull = _information(found, phi, a, sd, share, bad)
+        a = np.linalg.solve(information + np.diag(1 / prior), pull)
     information, pull = _information(found, phi, a, model, share, bad)
     full = information + np.diag(1 / prior)
     slope = pull - full @ a
-    determinant = np.log(prior).sum() + np.linalg.slogdet(full)[1]
-    peak = slope @ np.linalg.solve(full, slope) - (a**2 / prior).sum()
-    return log_all + 0.5 * (peak - determinant)
+    return (
+        log_all(a)
+        - 0.5 * (a**2 / prior).sum()
+        - 0.5 * np.log(prior).sum()
+        - 0.5 * np.linalg.slogdet(full)[1]
+        + 0.5 * slope @ np.linalg.solve(full, slope)
+    )
 
 
 def _information(found: CellModes, phi, a, sd: float, share: float, bad):
@@ -289,26 +288,15 @@ def log_density(
     mask = mask_nats(kinds.unknown, kinds.of_object, image) if errors.amplitudes.unknown else 0.0
     found = np.zeros((len(nodes.sigma), len(nodes.table), len(nodes.scale)))
     table = modes_at_nodes(_take(cells, cells.label == TABLE), errors)
-    objects, shared, offsets = {}, {}, {}
-    middle, middle_scale = len(nodes.sigma) // 2, float(nodes.scale[len(nodes.scale) // 2])
-    for k in map(int, np.unique(label[label >= OBJECT])):
-        own, visible = _take(cells, cells.label == k), kinds.cell & (label == k)
-        metres = float(depth[visible].mean() / image.focal[0]) if visible.any() else 0.0
-        at_nodes = modes_at_nodes(own, errors)
-        shared[k] = shared_plane(own, at_nodes[middle], middle, middle_scale, errors, metres)
-        mean, model = shared[k].basis(*own.middle.T) @ shared[k].mode, middle_scale * float(errors.amplitudes.model)
-        offsets[k] = cell_offsets(own, at_nodes[middle], middle, mean, model, float(errors.amplitudes.bad_share))
-        offsets[k] = {n: (b - m, v) for (n, (b, v)), m in zip(offsets[k].items(), mean, strict=True)}
-        if len(own.middle):
-            objects[k] = own, at_nodes, metres
-    on_table = _take(cells, cells.label == TABLE)
-    none = np.zeros(len(on_table.middle))
-    offsets[TABLE] = cell_offsets(on_table, table[middle], middle, none, float(nodes.table[len(nodes.table) // 2]), 0.0)
-    edges = edge_windows(depth, label, kinds.edge, image, errors, shared, offsets)
+    objects = {}
+    for k in np.unique(cells.label[cells.label >= OBJECT]):
+        own = _take(cells, cells.label == k)
+        metres = depth[kinds.cell & (label == k)].mean() / float(image.focal[0])
+        objects[k] = own, modes_at_nodes(own, errors), metres
     for s in range(len(nodes.sigma)):
         fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
         fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
-        fixed += log_edges(edges, image, errors, s).sum() + log_outlines(edges, image, errors, s)
+        fixed += log_edges(depth, label, kinds.edge, image, errors, s).sum()
         for t, sd in enumerate(nodes.table.astype(float)):
             found[s, t] += fixed + table[s].normal(0.0, sd).sum()
         for own, at_nodes, metres in objects.values():

@@ -119,7 +119,6 @@ def amplitudes_of(settings: ParserSettings) -> Amplitudes:
         settings.edge_share,
         settings.edge_blur,
         settings.object_lean,
-        settings.outline_sigma,
     )
-    bias, waves, length, model, bad, edge, blur, lean, outline = map(np.float32, known)
-    return Amplitudes(bias, waves, length, model, bad, edge, blur, lean, outline, np.bool_(settings.unknown))
+    bias, waves, length, model, bad, edge, blur, lean = map(np.float32, known)
+    return Amplitudes(bias, waves, length, model, bad, edge, blur, lean, np.bool_(settings.unknown))

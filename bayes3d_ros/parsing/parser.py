@@ -49,7 +49,7 @@ class SceneParser:
         self._grid = noise_marginal.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
         self._sample_noise = jax.jit(sample_noise)
-        self._gauss = jax.jit(_table_errors, static_argnums=1)
+        self._gauss = jax.jit(_errors_of_samples, static_argnums=1)
         self._compiled: set[tuple[int, ...]] = set()  # shapes of the arrays that images are scored in
 
     @property
@@ -190,7 +190,7 @@ class SceneParser:
         if not matters:
             return Stage.without_scenes(float(state.log_evidence), state.objects.x.shape[1])
         noise = self._sample_noise(key, model, state.loglik_grid)
-        gauss = self._gauss(jax.random.fold_in(key, 2), len(state.objects.x))
+        gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
         objects, gauss, log_weight, noise, log_evidence = jax.device_get(
             (state.objects, gauss, state.log_weight, noise, state.log_evidence)
         )
@@ -237,7 +237,9 @@ class SceneParser:
             reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
             if not reached or (not settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
-        return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table)
+        image = seen.image
+        outline = settings.outline_sigma / float(image.focal[0]) if settings.shares_errors else 0.0
+        return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline)
 
     def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):
         """Depth and labels of the best scene at the input's size."""
@@ -249,9 +251,9 @@ class SceneParser:
         return scene.with_things(frame, seen, depth, label)
 
 
-def _table_errors(key: PRNGKeyArray, scenes: int) -> Float[Array, "N 3"]:
-    """Standard normal numbers for the table of every scene."""
-    return jax.random.normal(key, (scenes, 3))
+def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M1 3"]:
+    """Standard normal numbers for the table and each object of every scene."""
+    return jax.random.normal(key, (shape[0], shape[1] + 1, 3))
 
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:

@@ -24,7 +24,9 @@ class Stage(NamedTuple):
     """What is kept of the scenes of k objects."""
 
     objects: Placement
-    gauss: Float[np.ndarray, "N 3"]  # standard normal: of the table's two tilts and height
+    gauss: Float[
+        np.ndarray, "N M1 3"
+    ]  # standard normal: of the table's two tilts and height, then of each object's picture
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
@@ -37,7 +39,7 @@ class Stage(NamedTuple):
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        return cls(objects, np.zeros((0, 3), np.float32), zero, zero, zero, log_evidence, [])
+        return cls(objects, np.zeros((0, slots + 1, 3), np.float32), zero, zero, zero, log_evidence, [])
 
 
 def mixture(
@@ -47,9 +49,10 @@ def mixture(
     library: LibraryArrays,
     table: Table,
     seen: SeenTable,
+    outline: float,
 ) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
     """The mixture of stages of so many known objects, p(n | image) ~ P(n) Z_n; log p(image) - log p(image | empty); and
-    of each sample what is of no type."""
+    of each sample what is of no type. outline: standard deviation of where an object's picture stands, as a slope."""
     log_z = np.array([s.log_evidence for s in stages])
     log_evidence = np.logaddexp.reduce(log_prior + log_z)
     log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
@@ -61,9 +64,11 @@ def mixture(
     things = [things[k] for k in keep] if things else [()] * len(keep)
     # Each scene twice, with errors of either sign: means stay where they are.
     gauss = np.concatenate([s.gauss for s in stages])[keep]
-    gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None]
-    keep, table_error = np.repeat(keep, 2), gauss * seen.error_sd + seen.error
-    objects = jax.tree.map(lambda a: np.repeat(a, 2, 0), objects)
+    gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None, None]
+    keep, table_error = np.repeat(keep, 2), gauss[:, 0] * seen.error_sd + seen.error
+    objects = _beside_pictures(
+        jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 1:], library, table, outline
+    )
     things = [held for held in things for _ in range(2)]
     moved = _moved(table_error)
     held = np.arange(objects.type.shape[1]) < n[keep, None]
@@ -90,6 +95,23 @@ def mixture(
         size=every.size.astype(np.float32),
     )
     return samples, float(log_evidence), things
+
+
+def _beside_pictures(
+    pictures: Placement, gauss: Float[np.ndarray, "S M 3"], library: LibraryArrays, table: Table, outline: float
+) -> Placement:
+    """Objects, given their pictures.
+
+    The likelihood is of the picture: where outlines and surfaces are seen. All outlines of an object are displaced
+    together: on the table by N(0, (outline depth)^2) along x and y, and by as much of a turn as moves its corners so
+    far. The prior is flat, so an object given its picture is a normal about it, whatever the image."""
+    T = np.asarray(table.T_camera_table, np.float64)
+    depth = T[2, 0] * pictures.x + T[2, 1] * pictures.y + T[2, 3]
+    size = np.asarray(library.face_size, np.float64)[pictures.type.clip(0), pictures.face.clip(0)]
+    sd = outline * np.maximum(depth, 0.0)
+    turn = sd / np.maximum(np.linalg.norm(size, axis=-1) / 12**0.5, 1e-3)
+    x, y = pictures.x + sd * gauss[..., 0], pictures.y + sd * gauss[..., 1]
+    return pictures._replace(x=x, y=y, yaw=np.mod(pictures.yaw + turn * gauss[..., 2], 2 * np.pi))
 
 
 class _Slots(NamedTuple):

@@ -24,8 +24,8 @@ from bayes3d_ros.objects.placement import Placement, Table
 
 trimesh = pytest.importorskip("trimesh")
 SIGMA, P, OUTLIER = 0.001, 0.005, 0.015
-SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.0005, 0.05, 0.001, 0.15, 0.1, 0.7, 0.015, 0.0008)))
-NONE = Amplitudes(*map(np.float32, (0, 0, 0.05, 0, 0, 0, 0, 0, 0)), np.False_)
+SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.0005, 0.05, 0.001, 0.15, 0.1, 0.7, 0.015)))
+NONE = Amplitudes(*map(np.float32, (0, 0, 0.05, 0, 0, 0, 0, 0)), np.False_)
 CAMERA = Intrinsics(120.0, 120.0, 47.5, 35.5, 96, 72)
 NEAR, FAR, SIGMA_MAX, WINDOW = 0.1, 5.0, 0.005, 3
 
@@ -38,15 +38,7 @@ def cells(residuals, lost=0.0):
     middle = 3.0 * np.stack([k % 6, k // 6], 1)
     label = np.full(len(residual), slow.OBJECT)
     return slow.SurfaceCells(
-        residual,
-        whole,
-        OUTLIER * whole,
-        lost * whole,
-        whole > 0,
-        label,
-        middle,
-        k,
-        np.full((len(residual), 4), -np.inf),
+        residual, whole, OUTLIER * whole, lost * whole, whole > 0, label, middle, np.full((len(residual), 4), -np.inf)
     )
 
 

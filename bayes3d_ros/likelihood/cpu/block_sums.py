@@ -9,8 +9,6 @@ from bayes3d_ros.likelihood.cpu.buffers import f32
 from bayes3d_ros.likelihood.cpu.cells import CELLS_SIDE_BY_SIDE, NO_MODE, find_modes, normal_cells, table_cells
 from bayes3d_ros.likelihood.cpu.compiling import strict
 from bayes3d_ros.likelihood.cpu.edges import log_edge
-from bayes3d_ros.likelihood.cpu.offsets import add_offsets, begin_offsets
-from bayes3d_ros.likelihood.cpu.outline_error import add_edge
 from bayes3d_ros.likelihood.cpu.patches import CELL, EDGE, HIDDEN, NEW, OLD, TABLE, UNKNOWN
 from bayes3d_ros.likelihood.cpu.windows import log
 from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SEEN_THROUGH
@@ -44,9 +42,8 @@ def _labels_of_cells(scene, rectangle, stride, left, top):
 
 @strict
 def _gather(
-    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work,
-    number,
-):  # fmt: skip
+    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
+):
     """The cell of one label in a block, as the next of the batch."""
     u0, u1, v0, v1 = rectangle
     planes, returns_sorted = cell_work
@@ -76,7 +73,7 @@ def _gather(
     near = (median > f32(-BAD_DEPTH)) & (median < f32(SEEN_THROUGH)) & (label != TABLE)
     for s in range(len(batch.own_plane) // w):
         batch.own_plane[s * w + used] = planes[s] if near else NO_MODE
-    batch.label[used], batch.place_of_sum[used], batch.block[used] = label, place_of_sum, number
+    batch.label[used], batch.place_of_sum[used] = label, place_of_sum
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
 
 
@@ -99,7 +96,7 @@ def _add_cells(batch, used, label, sums, column):
 
 
 @strict
-def _weigh(batch, used, returns, own, most, new_cells, nodes, offsets, fixed, old):
+def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
     """The batch's cells into sums; those of the new object are kept. Returns how many these are now."""
     sigma, p_outlier, table, scale, amplitudes = nodes
     w, tables, scales = CELLS_SIDE_BY_SIDE, len(table), len(scale)
@@ -110,8 +107,6 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, offsets, fixed, ol
         of_new += 1 if batch.label[c] == NEW else 0
     for s in range(len(sigma)):
         find_modes(batch, returns, sigma[s], p_outlier[s], s == 0)
-        if s == len(sigma) // 2:
-            add_offsets(offsets, batch, used, s, nodes)
         for t in range(tables if of_table > 0 else 0):
             table_cells(batch, table[t] * table[t])
             _add_cells(batch, used, TABLE, fixed, s * tables + t)
@@ -128,90 +123,66 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, offsets, fixed, ol
                 own.place[at] = batch.place[which * w + c]
                 own.curvature[at] = batch.curvature[which * w + c]
             own.outliers[s * most + kept] = batch.outliers[c]
-            own.own_plane[s * most + kept] = batch.own_plane[s * w + c]
+            own.bad[s * most + kept] = batch.own_plane[s * w + c]
             own.column[kept], own.row[kept], own.number[kept] = batch.column[c], batch.row[c], batch.number[c]
-            own.block[kept] = batch.block[c]
             kept += 1
     return new_cells + of_new
 
 
 @strict
-def score_pixels(
-    picture, returns, space, scene, blocks, block, stride, left, top, nodes, error, offsets, edge, outline, fixed,
-    one_row,
-):  # fmt: skip
-    """What returns that belong to no cell say, added to sums, and to those of the new object's outline. error: that
-    the new object's returns share."""
-    height, width = len(picture.ray_y), len(picture.ray_x)
-    across = (width + block - 1) // block
-    for number in blocks:
-        top_row, first_column = number // across * block, number % across * block
-        sums = fixed[0 if one_row else number]
-        for v in range(top_row, min(top_row + block, height)):
-            for u in range(first_column, min(first_column + block, width)):
-                k = (v - top) * stride + u - left
-                kind = scene.kind[k]
-                if kind == EDGE:
-                    log_edge(
-                        picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, error,
-                        offsets, number, edge,
-                    )  # fmt: skip
-                    if edge.normal[0] != 0 or edge.normal[1] != 0:
-                        add_edge(outline, edge, float(u), float(v))
-                elif kind in (UNKNOWN, HIDDEN):
-                    _log_other(picture, returns, space, scene, k, u, v, nodes, edge.value)
-                else:
-                    continue
-                tables = len(nodes.table)
-                for s in range(len(edge.value)):
-                    for t in range(tables):
-                        sums[s * tables + t] += edge.value[s]
+def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
+    """What returns that belong to no cell say, added to sums."""
+    sigma, p_outlier, table, _, amplitudes = nodes
+    window, values = work
+    u0, u1, v0, v1 = rectangle
+    tables = len(table)
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            k = (v - top) * stride + u - left
+            kind = scene.kind[k]
+            if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
+                continue
+            if kind == EDGE:
+                log_edge(picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, window, values)
+            for s in range(len(sigma)):
+                if kind == UNKNOWN and amplitudes.unknown > 0:
+                    values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
+                elif kind == UNKNOWN:
+                    values[s] = log(p_outlier[s] * picture.outlier_scale * space.depth[k] * space.depth[k])
+                elif kind == HIDDEN:
+                    lost = f32(LOST_SHARE) * amplitudes.edge_share if scene.near_outline[k] != 0 else f32(0.0)
+                    values[s] = log(p_outlier[s] + lost)
+                for t in range(tables):
+                    sums[s * tables + t] += values[s]
 
 
 @strict
-def _log_other(picture, returns, space, scene, k, u, v, nodes, values):
-    """log density of a return of something unknown, or log probability of one from beyond the workspace."""
-    amplitudes, z = nodes.amplitudes, space.depth[k]
-    for s in range(len(values)):
-        if scene.kind[k] == HIDDEN:
-            lost = f32(LOST_SHARE) * amplitudes.edge_share if scene.near_outline[k] != 0 else f32(0.0)
-            values[s] = log(nodes.p_outlier[s] + lost)
-        elif amplitudes.unknown > 0:
-            values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
-        else:
-            values[s] = log(nodes.p_outlier[s] * picture.outlier_scale * z * z)
-
-
-@strict
-def score_cells(
-    picture, returns, space, scene, blocks, block, stride, left, top, nodes, cell_work, batch, own, offsets, fixed, old,
+def score_blocks(
+    picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
     one_row,
 ):  # fmt: skip
-    """What the cells of blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how
-    many cells of the new object were kept."""
+    """What blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how many cells of
+    the new object were kept."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
     used, new_cells = 0, 0
-    begin_offsets(offsets, blocks, nodes)
     _clear(batch, returns_a_cell)
     for number in blocks:
         v, u = number // across * block, number % across * block
         here = (u, min(u + block, width), v, min(v + block, height))
         place = 0 if one_row else number
+        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, work, fixed[place])
         here_labels = _labels_of_cells(scene, here, stride, left, top)
         for label in range(TABLE, NEW + 1):
             if here_labels >> label & 1 == 0:
                 continue
-            _gather(
-                picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work,
-                number,
-            )  # fmt: skip
+            _gather(picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work)
             used += 1
             if used == CELLS_SIDE_BY_SIDE:
-                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, offsets, fixed, old)
+                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
                 used = 0
                 _clear(batch, returns_a_cell)
     if used > 0:
-        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, offsets, fixed, old)
+        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
     return new_cells

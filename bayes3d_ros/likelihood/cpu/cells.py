@@ -39,7 +39,6 @@ class Batch(NamedTuple):
     lost: Float[np.ndarray, "K*w"]  # density of a return near an outline that lies anywhere
     label: Int[np.ndarray, "w"]
     place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a cell is added to
-    block: Int[np.ndarray, "w"]
     column: Float[np.ndarray, "w"]  # mean place of its pixels
     row: Float[np.ndarray, "w"]
     number: Float[np.ndarray, "w"]  # of returns
@@ -62,7 +61,6 @@ def new_batch(returns, pairs):
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
-        np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
@@ -168,7 +166,7 @@ def find_modes(batch, returns, sigma, p, first):
 
 
 @inlined
-def good_mode(height, place, curvature, mean, variance):
+def _good(height, place, curvature, mean, variance):
     """log of the integral of one mode over an offset ~ N(mean, variance)."""
     spread = f32(1.0) + curvature * variance
     off = place - mean
@@ -192,8 +190,8 @@ def normal_cells(batch, s, variance, share):
     own_plane, at = batch.own_plane, u64(s) * w
     height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value
     for c in range(w):
-        one = good_mode(height[c], place[c], curvature[c], f32(0.0), variance)
-        other = good_mode(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
+        one = _good(height[c], place[c], curvature[c], f32(0.0), variance)
+        other = _good(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
         worse = bad_mode(height[c], place[c], curvature[c])
         worst = bad_mode(height[w + c], place[w + c], curvature[w + c])
         free = own_plane[at + c] + LOG_HALF
@@ -209,7 +207,7 @@ def table_cells(batch, variance):
     w = u64(CELLS_SIDE_BY_SIDE)
     height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value
     for c in range(w):
-        one = good_mode(height[c], place[c], curvature[c], f32(0.0), variance)
-        other = good_mode(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
+        one = _good(height[c], place[c], curvature[c], f32(0.0), variance)
+        other = _good(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
         high = larger(larger(one, other), outliers[c])
         value[c] = high + log(exp(one - high) + exp(other - high) + exp(outliers[c] - high))

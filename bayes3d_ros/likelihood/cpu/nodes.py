@@ -26,7 +26,7 @@ class NodeArrays(NamedTuple):
 def nodes_of(frame, first):
     """From a target's arguments: this one and the four after it."""
     a = floats(frame, first + 4)
-    amplitudes = Amplitudes(a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9])
+    amplitudes = Amplitudes(a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8])
     return NodeArrays(
         floats(frame, first), floats(frame, first + 1), floats(frame, first + 2), floats(frame, first + 3), amplitudes
     )

@@ -8,7 +8,7 @@ The densities are those of `likelihood/slow_shared_errors.py`, written again in 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bayes3d_ros.likelihood.cpu.buffers import f32, u64
 from bayes3d_ros.likelihood.cpu.cells import LOG_HALF, NO_MODE, bad_mode
@@ -31,8 +31,6 @@ class ObjectCells(NamedTuple):
     column: Float[np.ndarray, "M"]
     row: Float[np.ndarray, "M"]
     number: Float[np.ndarray, "M"]  # of returns
-    own_plane: Float[np.ndarray, "S*M"]  # log density with a plane of its own
-    block: Int[np.ndarray, "M"]
     x: Float[np.ndarray, "M"]  # metres from the middle
     y: Float[np.ndarray, "M"]
 
@@ -48,8 +46,6 @@ def new_object_cells(pairs, most):
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
-        np.zeros(pairs * most, np.float32),
-        np.zeros(most, np.int64),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
     )
@@ -73,13 +69,13 @@ def place_cells(cells, count, metres):
 
 @fast
 def begin_object(cells, s, most, count, share):
-    """What bad cells say, at one pair of noise, but for outliers."""
+    """What bad cells say, at one pair of noise, but for outliers: `cells.bad` holds what planes of their own say."""
     first, at = u64(2 * s * most), u64(s * most)
     second = first + u64(most)
     for c in range(u64(count)):
         one = bad_mode(cells.height[first + c], cells.place[first + c], cells.curvature[first + c])
         other = bad_mode(cells.height[second + c], cells.place[second + c], cells.curvature[second + c])
-        free = cells.own_plane[at + c] + LOG_HALF
+        free = cells.bad[at + c] + LOG_HALF
         high = larger(larger(one, other), free)
         bad = high + log(exp(one - high) + exp(other - high) + exp(free - high))
         cells.bad[at + c] = bad if share > f32(0.0) else NO_MODE
@@ -187,85 +183,39 @@ def _add_priors(sums, level, slope):
     sums[5] += 1 / slope
 
 
-class SharedError(NamedTuple):
-    """The mode of an object's shared error at the middle node, for the pixels that belong to no cell."""
-
-    mode: Float[np.ndarray, "3"]  # bias (m), slopes along x and y
-    covariance: Float[np.ndarray, "6"]  # of these: xx xy xz yy yz zz
-    middle: Float[np.ndarray, "3"]  # of the object's cells: column, row; and metres a pixel
-    warp: Float[np.ndarray, "3"]  # metres of depth at the image's first pixel, a column, a row
-
-
-@allocating
-def new_shared_error():
-    return SharedError(np.zeros(3), np.zeros(6, np.float32), np.zeros(3, np.float32), np.zeros(3, np.float32))
-
-
 @strict
-def no_cells(amplitudes, error):
-    """The shared error of an object of which there is no cell: its prior, without slopes."""
-    error.mode[:], error.covariance[:], error.middle[:], error.warp[:] = 0.0, f32(0), f32(0), f32(0)
-    error.covariance[0], _ = _priors(1.0, amplitudes)
-
-
-@strict
-def find_shared_error(cells, s, most, count, scale, amplitudes, metres, sums, error):
-    """The mode of an object's shared error at one node, by reweighted steps, and its covariance in the last one.
-    metres: a pixel at the object."""
-    a, middle, warp = error.mode, error.middle, error.warp
+def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
+    """The mode of an object's shared error at one node, by reweighted steps, into a: bias (m), slopes along x and y."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
-    level, slope = _priors(1.0, amplitudes)
-    no_cells(amplitudes, error)
-    middle[0], middle[1] = place_cells(cells, count, metres)
-    middle[2] = metres
+    level, slope = _priors(scale, amplitudes)
+    a[0], a[1], a[2] = 0.0, 0.0, 0.0
     if level == 0:
         return
     for step in range(REWEIGHTED_STEPS):
         _pass(cells, s, most, count, a, f32(variance + level) if step == 0 else variance, share, sums)
         _add_priors(sums, level, slope)
         a[0], a[1], a[2], _ = _solve(sums, sums[6:9])
-    warp[1], warp[2] = a[1] * metres, a[2] * metres
-    warp[0] = a[0] - warp[1] * middle[0] - warp[2] * middle[1]
-    one, at = sums[6:9], 0
-    for i in range(3):
-        for j in range(3):
-            one[j] = 1.0 if i == j else 0.0
-        x, y, z, _ = _solve(sums, one)
-        error.covariance[at] = x if i == 0 else (y if i == 1 else z)
-        if i == 0:
-            error.covariance[1], error.covariance[2] = y, z
-        elif i == 1:
-            error.covariance[4] = z
-        at = 3 if i == 0 else 5
 
 
 @strict
 def log_object(cells, s, most, count, scale, amplitudes, sums, a):
     """log density of the cells of one object at one node, relative to `reference_height`: its shared error integrated
-    out by a paraboloid about a, which is near the mode. scale: of its errors' amplitudes."""
+    out by a paraboloid about a, which is near the mode."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
+    level, slope = _priors(scale, amplitudes)
     _pass(cells, s, most, count, a, variance, share, sums)
     value = _log_of_shares(sums)
-    level, slope = _priors(scale, amplitudes)
     if level == 0:
         return value
-    return value + _log_integral(sums, a, level, slope)
-
-
-@strict
-def _log_integral(sums, a, level, slope):
-    """log of the integral over an object's shared error, with these prior variances, of the paraboloid about a whose
-    information and pull are in `sums`, 0 at a."""
-    pull, full = sums[15:18], sums[9:15]
-    for k in range(6):
-        full[k] = sums[k]
-    _add_priors(full, level, slope)
-    pull[0] = sums[6] - full[0] * a[0] - full[1] * a[1] - full[2] * a[2]
-    pull[1] = sums[7] - full[1] * a[0] - full[3] * a[1] - full[4] * a[2]
-    pull[2] = sums[8] - full[2] * a[0] - full[4] * a[1] - full[5] * a[2]
-    x, y, z, log_determinant = _solve(full, pull)
+    _add_priors(sums, level, slope)
+    pull = sums[6:9]
+    pull[0] -= sums[0] * a[0] + sums[1] * a[1] + sums[2] * a[2]
+    pull[1] -= sums[1] * a[0] + sums[3] * a[1] + sums[4] * a[2]
+    pull[2] -= sums[2] * a[0] + sums[4] * a[1] + sums[5] * a[2]
+    x, y, z, log_determinant = _solve(sums, pull)
     return (
-        -0.5 * (a[0] * a[0] / level + (a[1] * a[1] + a[2] * a[2]) / slope)
+        value
+        - 0.5 * (a[0] * a[0] / level + (a[1] * a[1] + a[2] * a[2]) / slope)
         - 0.5 * (np.log(level) + 2 * np.log(slope) + log_determinant)
         + 0.5 * (pull[0] * x + pull[1] * y + pull[2] * z)
     )

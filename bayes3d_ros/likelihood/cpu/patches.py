@@ -18,7 +18,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     OUTLINE_NATS,
     SEAM_DEPTH,
     SEAM_NATS,
-    SHARPEST_BEND,
+    STEEPEST,
 )
 
 NOTHING, TABLE, OLD, NEW = 0, 1, 2, 3  # labels: the objects that were there before are one
@@ -110,15 +110,14 @@ def _find_several(depth, label, seen, first, last, stride, step_x, step_y, sever
         front[k], apart_from[k] = depth[k], f32(_NO_OBJECT)
     for dv in range(-1, 2):
         for du in range(-1, 2):
-            limit = f32(SHARPEST_BEND) * max(f32(abs(dv)) * step_y, f32(abs(du)) * step_x)
+            limit = f32(STEEPEST) * max(f32(abs(dv)) * step_y, f32(abs(du)) * step_x)
             away = i32(dv * stride + du)
             for k in range(u64(first), u64(last)):
                 other = u64(i32(k) + away)
                 there = label[other]
-                opposite = u64(i32(k) - away)
-                bend = abs(depth[other] + depth[opposite] - f32(2.0) * depth[k])
-                bent = (label[opposite] != u8(NOTHING)) & (bend > limit * depth[k])
-                several[k] |= u8((there != u8(NOTHING)) & ((there != label[k]) | bent))
+                apart = abs(depth[other] - depth[k])
+                steep = (there != label[k]) | (apart > limit * depth[k])
+                several[k] |= u8((there != u8(NOTHING)) & steep)
                 of_object = there >= u8(OLD)
                 front[k] = lesser(front[k], depth[other] if of_object else f32(NO_SURFACE_METRES))
                 away_from = abs(seen[k] - depth[other])

@@ -5,11 +5,11 @@ numba compiles, as XLA calls them on CPUs."""
 
 import numpy as np
 
-from bayes3d_ros.likelihood.cpu.block_sums import score_cells, score_pixels
+from bayes3d_ros.likelihood.cpu.block_sums import score_blocks
 from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
 from bayes3d_ros.likelihood.cpu.cells import new_batch
 from bayes3d_ros.likelihood.cpu.compiling import handler, strict
-from bayes3d_ros.likelihood.cpu.edges import new_edge
+from bayes3d_ros.likelihood.cpu.edges import new_window
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
 from bayes3d_ros.likelihood.cpu.object_cells import (
@@ -17,12 +17,9 @@ from bayes3d_ros.likelihood.cpu.object_cells import (
     find_shared_error,
     log_object,
     new_object_cells,
-    new_shared_error,
-    no_cells,
+    place_cells,
     reference_height,
 )
-from bayes3d_ros.likelihood.cpu.offsets import add_new_offsets, new_offsets
-from bayes3d_ros.likelihood.cpu.outline_error import begin_outline, log_outline, new_outline_sums
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
     Returns,
@@ -67,7 +64,6 @@ def _gain_of(
     sigma, p_outlier, table, scale, amplitudes = nodes
     fixed, old, touched, pixel_work, cell_work = work
     known, former_fixed, former_old = former_sums
-    edge, outline, error, offsets = pixel_work
     border, tables, scales = 1, len(table), len(scale)
     height, width = len(picture.ray_y), len(picture.ray_x)
     rectangle = find_outlines(things, n, objects, picture, space)
@@ -94,27 +90,10 @@ def _gain_of(
     metres, pixels = find_changes(space, now, former, first, last, patch.changes)
     count = _find_touched(patch.changes, (u0, u1, v0, v1), block, stride, left, top, across, patch.row, touched)
     fixed[0, :], old[0, :] = mask, 0.0
-    new_cells = score_cells(
-        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, cell_work, batch, own, offsets,
-        fixed, old, True,
+    new_cells = score_blocks(
+        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, pixel_work, cell_work, batch,
+        own, fixed, old, True,
     )  # fmt: skip
-    most, middle = len(own.column), scale[scales // 2]
-    no_cells(amplitudes, error)
-    if new_cells > 0:
-        metres = f32(metres / max(pixels, 1) / picture.focal_x)
-        for s in range(len(sigma)):
-            begin_object(own, s, most, new_cells, amplitudes.bad_share)
-        # One paraboloid for all nodes: about the mode at the middle one.
-        find_shared_error(own, len(sigma) // 2, most, new_cells, middle, amplitudes, metres, sums, error)
-        add_new_offsets(offsets, own, len(sigma) // 2, most, new_cells, error.mode, nodes)
-        for k in range(WARP):
-            warp[k] = error.warp[k]
-    begin_outline(outline)
-    score_pixels(
-        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, error, offsets, edge, outline,
-        fixed, True,
-    )  # fmt: skip
-    outline_sd = amplitudes.outline * picture.focal_x
     # What a block says of the scene as it was is worked out once for all that is added to that scene.
     fresh = 0
     for k in range(count):
@@ -123,27 +102,31 @@ def _gain_of(
             touched[count + fresh] = touched[k]
             fresh += 1
     if fresh > 0:
-        blocks = touched[count : count + fresh]
-        score_cells(
-            picture, returns, space, former, blocks, block, stride, left, top, nodes, cell_work, batch, own,
-            offsets, former_fixed, former_old, False,
-        )  # fmt: skip
-        score_pixels(
-            picture, returns, space, former, blocks, block, stride, left, top, nodes, error, offsets, edge, outline,
-            former_fixed, False,
+        score_blocks(
+            picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
+            pixel_work, cell_work, batch, own, former_fixed, former_old, False,
         )  # fmt: skip
     for k in range(count):
         for level in range(fixed.shape[1]):
             fixed[0, level] -= former_fixed[touched[k], level]
         for level in range(old.shape[1]):
             old[0, level] -= former_old[touched[k], level]
+    metres = f32(metres / max(pixels, 1) / picture.focal_x)
+    error, most = sums[12:15], len(own.column)
+    if new_cells > 0:
+        column, row = place_cells(own, new_cells, metres)
+        for s in range(len(sigma)):
+            begin_object(own, s, most, new_cells, amplitudes.bad_share)
+        # One paraboloid for all nodes: about the mode at the middle one.
+        find_shared_error(own, len(sigma) // 2, most, new_cells, scale[scales // 2], amplitudes, sums, error)
+        warp[1], warp[2] = error[1] * metres, error[2] * metres
+        warp[0] = error[0] - warp[1] * column - warp[2] * row
     for s in range(len(sigma)):
-        level = log_outline(outline, s, outline_sd)
-        level += reference_height(own, s, most, new_cells) if new_cells > 0 else 0.0
+        level = reference_height(own, s, most, new_cells) if new_cells > 0 else 0.0
         for a in range(scales):
             value = old[0, s * scales + a] + level
             if new_cells > 0:
-                value += log_object(own, s, most, new_cells, scale[a], amplitudes, sums, error.mode)
+                value += log_object(own, s, most, new_cells, scale[a], amplitudes, sums, error)
             for t in range(tables):
                 gain[(s * tables + t) * scales + a] = value + fixed[0, s * tables + t]
 
@@ -179,13 +162,13 @@ def _shared_gain(frame):
     own = new_object_cells(pairs, blocks)
     work = (
         np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
-        (new_edge(nodes.amplitudes.edge_blur, pairs), new_outline_sums(pairs), new_shared_error(), new_offsets(blocks)),
+        (new_window(nodes.amplitudes.edge_blur), np.zeros(pairs, np.float32)),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
     )  # fmt: skip
     former_sums = (
         np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
     )  # fmt: skip
-    sums, levels, last = np.zeros(18), pairs * tables * scales, -1
+    sums, levels, last = np.zeros(15), pairs * tables * scales, -1
     for k in range(len(gain)):
         gain[k] = f32(0)
     for k in range(len(warp)):
