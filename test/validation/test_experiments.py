@@ -165,6 +165,16 @@ def test_a_singular_covariance_covers_nothing_but_the_truth(rows):
     assert rows([truth], [estimate("block", pose((0, 0, 0.8)), sigma=0.0)])[1]["covered"] is True
 
 
+def test_an_unknown_thing_is_found_for_no_type(rows):
+    """It stands where the block does, and is no block."""
+    unknown = replace(
+        estimate("unknown", pose((0.1, 0, 0.8))), size=np.array(SIZE), size_sigma=np.zeros(3), contact_face=-1
+    )
+    frame, missed, false = rows([TrueObject("block", pose((0.1, 0, 0.8)), 1.0)], [unknown])
+    assert (frame["found"], frame["false"]) == (0, 1)
+    assert not missed["found"] and (false["what"], false["type"]) == ("false object", "unknown")
+
+
 def test_centres_of_boxes_are_compared_not_origins_of_meshes(rows):
     """A block turned upside down about its centre is where it was, though its origin is 8 cm away."""
     down = pose((0.1, 0, 0.88), (np.pi, 0, 0))
