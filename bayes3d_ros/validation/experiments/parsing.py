@@ -3,7 +3,7 @@
 """How right parsed frames are: every object of the bundled and the real recordings, how far off and how sure."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from itertools import islice
 from pathlib import Path
@@ -175,24 +175,18 @@ def failed_rows(where: Row, true: Sequence[TrueObject], error: str) -> list[Row]
 
 def _partners(true: Sequence[TrueObject], estimates: Sequence[ObjectEstimate], library: Library) -> dict[int, int]:
     """Index of the estimate that stands for a true object, of the same type."""
-    box = {model.name: model.T_object_box[:3, 3] for model in library.models}
-    here = np.array([estimated_pose(e)[:3, :3] @ _box_centre(e, box) + e.position for e in estimates]).reshape(-1, 3)
+    models = {model.name: model for model in library.models}
+    here = np.array([(estimated_pose(e) @ e.box(models)[0])[:3, 3] for e in estimates]).reshape(-1, 3)
     there = np.zeros((len(true), 3))
     for i, thing in enumerate(true):
         if thing.T_camera_object is None:
             here = np.zeros_like(here)  # names only: all are equally near
         else:
-            there[i] = thing.T_camera_object[:3, :3] @ box.get(thing.type, np.zeros(3)) + thing.T_camera_object[:3, 3]
+            model = models.get(thing.type)
+            there[i] = (thing.T_camera_object @ (model.T_object_box if model else np.eye(4)))[:3, 3]
     matches = match_objects([t.type for t in true], there, [e.type for e in estimates], here)
     same = [(i, j) for i, j in matches if i is not None and j is not None and true[i].type == estimates[j].type]
     return dict(same)
-
-
-def _box_centre(estimate: ObjectEstimate, box: Mapping[str, Float[np.ndarray, "3"]]) -> Float[np.ndarray, "3"]:
-    """In the object's frame, metres. An unknown thing's frame is at the middle of its box's base."""
-    if estimate.size is None:
-        return box[estimate.type]
-    return np.array([0.0, 0.0, estimate.size[2] / 2])
 
 
 def _object_row(
