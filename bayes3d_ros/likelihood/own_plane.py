@@ -7,22 +7,57 @@ In each block of the image the surface is a plane of its own, about a surface th
 
     d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `_DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
 
-and its returns err as those of any surface do. Each block's integral is worked out by Laplace's method about the plane
-that its returns make likeliest, for all that stand in front of the table, and is shared out evenly among them: what a
-surface does not cover of a block it does not pay for. So the image alone gives each return's log density.
+and its returns err as those of any surface do. With probability 1 - `_ANEW` a block goes on from the block to its left
+or from the one above, where there are such: its plane is then that block's, as the returns of that block alone tell,
+turned by N(0, `_BEND_SD`^2) along either axis, half of it between the middles of the two, and displaced by
+N(0, `_STEP_SD`^2). So the density of a block's returns depends on those to its left and above alone, and the product
+over all blocks integrates to one over all depths.
+
+Each block's integral is worked out by Laplace's method about the plane that its returns make likeliest, for all that
+stand in front of the table, and is shared out evenly among them: what a surface does not cover of a block it does not
+pay for. So the image alone gives each return's log density.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 # These change the posterior.
 _DEPTH_SD = 0.03  # metres
 _SLOPE_SD = 1.0
+_ANEW = 0.2
+_STEP_SD = 0.002  # metres
+_BEND_SD = 0.8
 _STEPS = 6
 _FIRST_WIDTH = 0.004  # metres: of inliers in the first step; from step to step it shrinks to the noise's
+_MORE_STEPS = 3  # where a plane is followed from the one that is found without neighbours
 _FEWEST_INLIERS = 0.5
+
+
+class _Blocks(NamedTuple):
+    """Returns of C blocks that stand in front of the table, at most K of a block."""
+
+    real: Bool[np.ndarray, "C K"]  # beyond a block's returns: false
+    depth: Float[np.ndarray, "C K"]  # metres from the middle
+    phi: Float[np.ndarray, "C K 3"]  # 1, x, y; zeros beyond
+    rays: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
+    outlier: Float[np.ndarray, "C K"]  # density
+    middle: Float[np.ndarray, "C"]  # metres: median depth
+    centre: Float[np.ndarray, "C 2"]  # column and row
+    metres: Float[np.ndarray, "C 2"]  # a pixel
+    of_return: Int[np.ndarray, "N"]  # block of each return
+    beside: Int[np.ndarray, "2 C"]  # the block to the left, and the one above; -1: none
+
+
+class _Planes(NamedTuple):
+    """Likeliest planes of C blocks, and log of the integrals over all planes."""
+
+    log_integral: Float[np.ndarray, "C"]
+    plane: Float[np.ndarray, "C 3"]  # metres from the middle, slopes
+    information: Float[np.ndarray, "C 3 3"]
 
 
 def own_plane_log_density(
@@ -39,10 +74,19 @@ def own_plane_log_density(
     outlier = float(image.outlier_scale) * np.maximum(depth, 1e-6) ** 2
     density = np.log(p_outlier.astype(float))[:, None, None] + np.log(outlier)
     v, u = np.nonzero(standing)
-    if not len(v):
-        return density.astype(np.float32)
+    if len(v):
+        blocks = _blocks_of(image, v, u, spread, outlier, block)
+        count = blocks.real.sum(1)
+        for s, (noise, p) in enumerate(zip(sigma.astype(float), p_outlier.astype(float), strict=True)):
+            density[s, v, u] = (_log_densities(blocks, noise, p) / count)[blocks.of_return]
+    return density.astype(np.float32)
+
+
+def _blocks_of(image: ScoredImage, v, u, spread, outlier, block: int) -> _Blocks:
+    """The returns at these rows and columns, by blocks."""
+    depth = np.asarray(image.depth, np.float64)
     across = -(-depth.shape[1] // block)
-    _, first, which = np.unique(v // block * across + u // block, return_index=True, return_inverse=True)
+    number, which = np.unique(v // block * across + u // block, return_inverse=True)
     order = np.argsort(which, kind="stable")
     slot = np.empty(len(which), int)
     count = np.bincount(which)
@@ -55,37 +99,78 @@ def own_plane_log_density(
 
     real = gathered(np.ones(len(v))) > 0
     z = gathered(depth[v, u])
-    middle = np.nanmedian(np.where(real, z, np.nan), 1)[:, None]
-    x, y = (
-        (gathered(place) - (gathered(place).sum(1) / count)[:, None]) * middle / float(focal)
-        for place, focal in ((u, image.focal[0]), (v, image.focal[1]))
-    )
-    phi = np.stack([np.ones(z.shape), x, y], -1) * real[..., None]
+    middle = np.nanmedian(np.where(real, z, np.nan), 1)
+    centre = np.stack([gathered(u).sum(1) / count, gathered(v).sum(1) / count], 1)
+    metres = middle[:, None] / np.asarray(image.focal, np.float64)
+    x = (gathered(u) - centre[:, :1]) * metres[:, :1]
+    y = (gathered(v) - centre[:, 1:]) * metres[:, 1:]
     norm2 = 1 + np.asarray(image.ray_x, np.float64)[u] ** 2 + np.asarray(image.ray_y, np.float64)[v] ** 2
-    precision = gathered(norm2 / spread[v, u].astype(np.float64) ** 2, 1.0)
-    none = gathered(outlier[v, u], 1.0)
-    for s, (noise, p) in enumerate(zip(sigma.astype(float), p_outlier.astype(float), strict=True)):
-        value = _integral(z - middle, phi, real, precision / noise**2, none, p)
-        density[s, v, u] = (value / count)[which]
-    return density.astype(np.float32)
+
+    def at(wanted: np.ndarray, there: np.ndarray) -> np.ndarray:
+        place = np.minimum(np.searchsorted(number, wanted), len(number) - 1)
+        return np.where(there & (number[place] == wanted), place, -1)
+
+    return _Blocks(
+        real,
+        np.where(real, z - middle[:, None], 0.0),
+        np.stack([np.ones(z.shape), x, y], -1) * real[..., None],
+        gathered(norm2 / spread[v, u].astype(np.float64) ** 2, 1.0),
+        gathered(outlier[v, u], 1.0),
+        middle,
+        centre,
+        metres,
+        which,
+        np.stack([at(number - 1, number % across > 0), at(number - across, number >= across)]),
+    )
 
 
-def _integral(z, phi, real, precision, outlier, p: float) -> Float[np.ndarray, "C"]:
-    """log of the integral over each block's plane; z: depth from the middle."""
-    prior = np.diag([_DEPTH_SD**-2, _SLOPE_SD**-2, _SLOPE_SD**-2])
-    plane = np.zeros((len(z), 3))
-    for step in range(_STEPS + 1):
-        width2 = 1 / precision + (_FIRST_WIDTH * 0.4**step if step < _STEPS else 0.0) ** 2
-        off = z - np.einsum("ckd,cd->ck", phi, plane)
+def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray, "C"]:
+    """Of each block's returns, given those of the blocks to its left and above."""
+    count = len(blocks.middle)
+    prior = np.broadcast_to(np.diag([_DEPTH_SD**-2, _SLOPE_SD**-2, _SLOPE_SD**-2]), (count, 3, 3))
+    alone = _planes(blocks, np.zeros((count, 3)), prior, noise, p, None)
+    beside = (blocks.beside >= 0).sum(0)
+    parts = [alone.log_integral + np.log(np.where(beside > 0, _ANEW, 1.0))]
+    for other in blocks.beside:
+        mean, precision = _going_on(_Planes(*(a[other] for a in alone)), blocks, other)
+        found = _planes(blocks, mean, precision, noise, p, alone.plane).log_integral
+        parts.append(np.where(other >= 0, found + np.log((1 - _ANEW) / np.maximum(beside, 1)), -np.inf))
+    parts.append(np.where(blocks.real, np.log(p * blocks.outlier), 0).sum(1))  # all of them are outliers
+    return np.logaddexp.reduce(parts)
+
+
+def _going_on(
+    planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"]
+) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3 3"]]:
+    """Mean and precision of the blocks' planes where they go on from these, which are of other blocks."""
+    apart = (blocks.centre - blocks.centre[other]) * blocks.metres[other]
+    move, bend = np.tile(np.eye(3), (len(apart), 1, 1)), np.tile(np.eye(3), (len(apart), 1, 1))
+    move[:, 0, 1:], bend[:, 0, 1:] = apart, apart / 2
+    mean = np.einsum("cde,ce->cd", move, planes.plane)
+    mean[:, 0] += blocks.middle[other] - blocks.middle
+    change = np.diag([_STEP_SD**2, _BEND_SD**2, _BEND_SD**2])
+    covariance = move @ np.linalg.inv(planes.information) @ move.swapaxes(1, 2) + bend @ change @ bend.swapaxes(1, 2)
+    return mean, np.linalg.inv(covariance)
+
+
+def _planes(blocks: _Blocks, mean, prior, noise: float, p: float, start: np.ndarray | None) -> _Planes:
+    """Planes with normal priors of these means and precisions. start: the planes that they are followed from; none:
+    they are sought with wide inliers first."""
+    precision = blocks.rays / noise**2
+    plane, steps = (np.zeros(mean.shape), _STEPS) if start is None else (start, _MORE_STEPS)
+    for step in range(steps + 1):
+        wide = _FIRST_WIDTH * 0.4**step if start is None and step < _STEPS else 0.0
+        width2 = 1 / precision + wide**2
+        off = blocks.depth - np.einsum("ckd,cd->ck", blocks.phi, plane)
         inlier = (1 - p) * np.exp(-0.5 * off**2 / width2) / np.sqrt(2 * np.pi * width2)
-        share = np.where(real, inlier / (p * outlier + inlier), 0)
+        share = np.where(blocks.real, inlier / (p * blocks.outlier + inlier), 0)
         weight = share / width2
-        information = np.einsum("ck,ckd,cke->cde", weight, phi, phi) + prior
-        if step < _STEPS:
-            pull = np.einsum("ck,ckd,ck->cd", weight, phi, z)
+        information = np.einsum("ck,ckd,cke->cde", weight, blocks.phi, blocks.phi) + prior
+        if step < steps:
+            pull = np.einsum("ck,ckd,ck->cd", weight, blocks.phi, blocks.depth) + np.einsum("cde,ce->cd", prior, mean)
             plane = np.linalg.solve(information, pull[..., None])[..., 0]
-    logs = np.where(real, np.log(np.where(real, p * outlier + inlier, 1)), 0).sum(1)
+    logs = np.where(blocks.real, np.log(np.where(blocks.real, p * blocks.outlier + inlier, 1)), 0).sum(1)
     cost = 0.5 * np.linalg.slogdet(information)[1] - 0.5 * np.linalg.slogdet(prior)[1]
-    found = logs - cost - 0.5 * np.einsum("cd,de,ce->c", plane, prior, plane)
-    nothing = np.where(real, np.log(p * np.where(real, outlier, 1)), 0).sum(1)
-    return np.logaddexp(np.where(share.sum(1) > _FEWEST_INLIERS, found, -np.inf), nothing)
+    apart = plane - mean
+    value = logs - cost - 0.5 * np.einsum("cd,cde,ce->c", apart, prior, apart)
+    return _Planes(np.where(share.sum(1) > _FEWEST_INLIERS, value, -np.inf), plane, information)

@@ -24,7 +24,7 @@ from bayes3d_ros.objects.placement import Placement, Table
 
 trimesh = pytest.importorskip("trimesh")
 SIGMA, P, OUTLIER = 0.001, 0.005, 0.015
-SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.0005, 0.05, 0.001, 0.15, 0.1, 0.7, 0.015)))
+SHIPPED = Amplitudes(*map(np.float32, (0.0012, 0.001, 0.05, 0.001, 0.15, 0.1, 0.7, 0.015)))
 NONE = Amplitudes(*map(np.float32, (0, 0, 0.05, 0, 0, 0, 0, 0)), np.False_)
 CAMERA = Intrinsics(120.0, 120.0, 47.5, 35.5, 96, 72)
 NEAR, FAR, SIGMA_MAX, WINDOW = 0.1, 5.0, 0.005, 3
@@ -243,3 +243,33 @@ def test_unknown_surfaces_cost_the_same_whatever_their_slope():
     costs = [_cost_a_cm2(_tilted(np.radians(a))) for a in (0, 20, 40, 60)] + [_cost_a_cm2(_cylinder)]
     assert min(costs) > 0
     assert max(costs) / min(costs) < 1.3, costs
+
+
+def test_an_unknown_surface_goes_on_from_block_to_block():
+    """Each block's density depends on its own returns and on those of the blocks to its left and above; a surface that
+    goes on costs less than blocks that are apart, each of them a plane."""
+    rays = CAMERA.rays()
+    patch = np.zeros(rays.shape[:2], bool)
+    patch[24:48, 40:64] = True
+    rng = np.random.default_rng(7)
+    noise = SIGMA * rng.normal(size=patch.shape)
+    blocks = np.kron(rng.uniform(-0.02, 0.02, (18, 24)), np.ones((4, 4)))
+
+    def log_density(depth):
+        image = scored_image(
+            CAMERA, np.where(patch, depth, 1.0), np.full(patch.shape, IN_WORKSPACE), np.full(patch.shape, 2.0), NEAR,
+            FAR, SIGMA_MAX,
+        )  # fmt: skip
+        return own_plane_log_density(image, patch, np.ones(patch.shape), 4, np.array([SIGMA]), np.array([P]))[0]
+
+    plane = _tilted(np.radians(30))(rays[..., 0], rays[..., 1]) + noise
+    smooth, apart = log_density(plane), log_density(plane + blocks)
+    per_block = (smooth - apart)[patch].sum() / 36
+    assert 2.5 < per_block < 5, per_block
+    moved = plane.copy()
+    moved[32:36, 48:52] += 0.004
+    changed = np.abs(log_density(moved) - smooth) > 1e-5
+    expected = np.zeros(patch.shape, bool)
+    for row, column in ((8, 12), (8, 13), (9, 12)):  # itself, and the blocks to its right and below
+        expected[4 * row : 4 * row + 4, 4 * column : 4 * column + 4] = True
+    assert np.array_equal(changed, expected)
