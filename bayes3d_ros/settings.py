@@ -99,10 +99,10 @@ class ParserSettings:
         0.0012, "standard deviation of depth errors that all returns of an object share", unit="m", low=0.0, high=0.05
     )
     surface_waves: float = setting(
-        0.0005, "standard deviation of depth errors that are waves over a surface", unit="m", low=0.0, high=0.05
+        0.001, "standard deviation of depth errors that are waves over a surface", unit="m", low=0.0, high=0.05
     )
     wave_length: float = setting(
-        0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
+        0.05, "distance over which such waves are alike (to a correlation of 1/e)", unit="m", low=0.005, high=1.0
     )
     model_error: float = setting(
         0.001,

@@ -5,15 +5,17 @@
 A return z of a pixel whose window shows one surface at depth d belongs to the cell of that surface in a block of the
 image, a square of a few pixels:
 
-    z = d + phi . a_object + b_cell + e,    e ~ p_out a(z) + (1 - p_out) N(0, sigma_i^2 / |r|^2).
+    z = d + phi . a_object + w_cell + b_cell + e,    e ~ p_out a(z) + (1 - p_out) N(0, sigma_i^2 / |r|^2).
 
 b ~ N(0, tau^2) is the error of a cell: of the table's surface as the camera sees it, or of an object's model. With
 probability pi an object's cell is bad (dents, wear, bled edges). Half of the bad ones are off as a whole,
 b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras do not see through solids. The other half are planes of their
 own, as blocks of unknown things are (`own_plane.py`), whose median residual is between -`BAD_DEPTH` and
-`SEEN_THROUGH`: dents have slopes. a_object ~ N(0, diag(bias^2 + wave^2, (wave / length)^2, (wave / length)^2)) is a
-depth error that the whole object shares, with phi = (1, x, y), metres from the middle of what is seen of it; the
-variance of its slopes also holds lean^2, as nothing stands upright to the degree.
+`SEEN_THROUGH`: dents have slopes. a_object ~ N(0, diag(bias^2, lean^2, lean^2)) is a depth error that the whole object
+shares, with phi = (1, x, y), metres from the middle of what is seen of it: nothing stands upright to the degree. w are
+waves over the object, a Gaussian process with covariance wave^2 exp(-distance / length), by Vecchia's approximation
+(Vecchia 1988, doi 10.1111/j.2517-6161.1988.tb01729.x): the density of a cell is that given the ones to its left and
+above, as far as these are good, so that the product over cells is a density whatever it approximates.
 
 A pixel whose window shows several surfaces is an edge, and belongs to no cell: the mixture of `density.py`, with each
 point as wide as its surface's errors make it and as likely as a blur of the image says (outlines of depth images are

@@ -45,7 +45,9 @@ class CellModes(NamedTuple):
     curvature: Float[np.ndarray, "2 C"]  # 1 / metres^2
     outliers: Float[np.ndarray, "C"]
 
-    def normal(self, mean: Float[np.ndarray, "*c"] | float, sd: float) -> Float[np.ndarray, "C"]:
+    def normal(
+        self, mean: Float[np.ndarray, "*c"] | float, sd: Float[np.ndarray, "*c"] | float
+    ) -> Float[np.ndarray, "C"]:
         """log of the integral over b ~ N(mean, sd^2)."""
         spread = 1 + self.curvature * sd**2
         apart = (self.place - mean) ** 2 * self.curvature / spread
@@ -222,42 +224,107 @@ def lost_density(errors: SharedErrorImage) -> float:
     return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH
 
 
+class Neighbours(NamedTuple):
+    """Of C cells of one object: the one in the block to the left and the one above (-1: none), and the correlations of
+    the object's waves with them, and between the two."""
+
+    left: Int[np.ndarray, "C"]
+    above: Int[np.ndarray, "C"]
+    alike: Float[np.ndarray, "C 3"]  # with the left one, with the one above, of the two with each other
+
+
+def neighbours(cells: SurfaceCells, phi: Float[np.ndarray, "C 3"], block: int, length: float) -> Neighbours:
+    """phi: 1, x and y of each cell, metres; block: pixels a side; length: of the waves, metres."""
+    at = {tuple(place): c for c, place in enumerate((cells.middle // block).astype(int).tolist())}
+
+    def alike(one: int, other: int) -> float:
+        return float(np.exp(-np.hypot(*(phi[one] - phi[other])[1:]) / length)) if min(one, other) >= 0 else 0.0
+
+    left = [at.get((column - 1, row), -1) for column, row in at]
+    above = [at.get((column, row - 1), -1) for column, row in at]
+    correlations = [
+        (alike(c, one), alike(c, up), alike(one, up)) for c, (one, up) in enumerate(zip(left, above, strict=True))
+    ]
+    return Neighbours(np.array(left, int), np.array(above, int), np.array(correlations).reshape(-1, 3))
+
+
+class CellsGivenOthers(NamedTuple):
+    """What C cells are off given the error that the object shares and the cells to their left and above: normal, with
+    mean `known` + `phi` a and this variance."""
+
+    known: Float[np.ndarray, "C"]  # metres
+    phi: Float[np.ndarray, "C 3"]
+    variance: Float[np.ndarray, "C"]
+
+
+def given_others(
+    found: CellModes, phi, a, model: float, waves: float, beside: Neighbours, share: float, bad
+) -> CellsGivenOthers:
+    """Vecchia's approximation of waves with correlation exp(-distance / length): each cell given those to its left and
+    above, as far as these are good. model, waves: variances of a cell's own error and of the waves; share: of bad
+    cells; bad: what they say."""
+    count = len(phi)
+    told, told_place = np.zeros(count), np.zeros(count)
+    given = CellsGivenOthers(np.zeros(count), phi.copy(), np.full(count, model + waves))
+    for c in range(count):
+        others = np.array([k for k in (beside.left[c], beside.above[c]) if k >= 0], int)
+        if waves > 0 and len(others):
+            with_left, with_above, both = beside.alike[c]
+            alike = np.array([r for r, k in ((with_left, beside.left[c]), (with_above, beside.above[c])) if k >= 0])
+            between = np.array([[1.0, both], [both, 1.0]])[: len(others), : len(others)]
+            uncertain = 1 / (waves * (told[others] + 1e-6))
+            part = np.linalg.solve(between + np.diag(uncertain), alike)
+            given.known[c] = part @ told_place[others]
+            given.phi[c] -= part @ phi[others]
+            given.variance[c] = model + waves * (1 - part @ alike)
+        mean = given.known[c] + given.phi[c] @ a
+        spread = 1 + found.curvature[:, c] * given.variance[c]
+        apart = (found.place[:, c] - mean) ** 2 * found.curvature[:, c] / spread
+        modes = np.log1p(-share) + found.height[:, c] - 0.5 * np.log(spread) - 0.5 * apart
+        with np.errstate(divide="ignore"):
+            total = logsumexp([*modes, np.log1p(-share) + found.outliers[c], np.log(share) + bad[c]])
+        tells = np.exp(modes - total) * found.curvature[:, c] / (1 + found.curvature[:, c] * model)
+        told[c] = tells.sum()
+        told_place[c] = tells @ found.place[:, c] / (told[c] + 1e-6)
+    return given
+
+
 def log_object(
     cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
 ) -> float:
     """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
     three reweighted steps. found: the cells' modes at the node."""
     amplitudes = errors.amplitudes
-    share, model = float(amplitudes.bad_share), scale * float(amplitudes.model)
+    share, model = float(amplitudes.bad_share), (scale * float(amplitudes.model)) ** 2
+    waves = (scale * float(amplitudes.wave)) ** 2
     bad = found.bad(cells.own_plane[:, node])
-
-    def log_cells(a, share, sd=model):
-        mean = phi @ a
-        with np.errstate(divide="ignore"):
-            return np.logaddexp(np.log1p(-share) + found.normal(mean, sd), np.log(share) + bad)
-
-    def log_all(a):
-        shares = [min(share * b, 0.9) for b in BAD_SPREAD]
-        return logsumexp([log_cells(a, s).sum() + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
-
     middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
     phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
-    bias2, wave2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.wave)) ** 2
-    slope2 = wave2 / float(amplitudes.length) ** 2 + (scale * float(amplitudes.lean)) ** 2
-    if bias2 + slope2 == 0:
-        return log_all(np.zeros(3))
-    prior = np.array([bias2 + wave2, slope2, slope2])
-    prior = np.maximum(prior, 1e-12)
+    beside = neighbours(cells, phi, int(errors.block), float(amplitudes.length))
+
+    def log_cells(given: CellsGivenOthers, share: float):
+        mean = given.known + given.phi @ a
+        with np.errstate(divide="ignore"):
+            good = np.log1p(-share) + found.normal(mean, np.sqrt(given.variance))
+            return np.logaddexp(good, np.log(share) + bad).sum()
+
     a = np.zeros(3)
-    for step in range(REWEIGHTED_STEPS):
-        sd = np.sqrt(model**2 + prior[0]) if step == 0 else model
-        information, pull = _information(found, phi, a, sd, share, bad)
+    bias2, slope2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.lean)) ** 2
+    prior = np.maximum([bias2, slope2, slope2], 1e-12)
+    for step in range(REWEIGHTED_STEPS if bias2 + slope2 > 0 else 0):
+        given = given_others(found, phi, a, model + prior[0] if step == 0 else model, waves, beside, share, bad)
+        information, pull = _information(found, given, a, share, bad)
         a = np.linalg.solve(information + np.diag(1 / prior), pull)
-    information, pull = _information(found, phi, a, model, share, bad)
+    given = given_others(found, phi, a, model, waves, beside, share, bad)
+    shares = [min(share * b, 0.9) for b in BAD_SPREAD]
+    log_all = logsumexp([log_cells(given, s) + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
+    if bias2 + slope2 == 0:
+        return log_all
+    information, pull = _information(found, given, a, share, bad)
     full = information + np.diag(1 / prior)
     slope = pull - full @ a
     return (
-        log_all(a)
+        log_all
         - 0.5 * (a**2 / prior).sum()
         - 0.5 * np.log(prior).sum()
         - 0.5 * np.linalg.slogdet(full)[1]
@@ -265,15 +332,16 @@ def log_object(
     )
 
 
-def _information(found: CellModes, phi, a, sd: float, share: float, bad):
+def _information(found: CellModes, given: CellsGivenOthers, a, share: float, bad):
     """What the good cells tell of a: responsibilities of modes, given a."""
-    mean = phi @ a
-    spread = 1 + found.curvature * sd**2
+    mean = given.known + given.phi @ a
+    spread = 1 + found.curvature * given.variance
     term = found.height - 0.5 * np.log(spread) - 0.5 * (found.place - mean) ** 2 * found.curvature / spread
     with np.errstate(divide="ignore"):
-        total = np.logaddexp(np.log1p(-share) + found.normal(mean, sd), np.log(share) + bad)
+        total = np.logaddexp(np.log1p(-share) + found.normal(mean, np.sqrt(given.variance)), np.log(share) + bad)
     weight = np.exp(np.log1p(-share) + term - total) * found.curvature / spread
-    return np.einsum("kc,ca,cb->ab", weight, phi, phi), np.einsum("kc,kc,ca->a", weight, found.place, phi)
+    pull = np.einsum("kc,kc,ca->a", weight, found.place - given.known, given.phi)
+    return np.einsum("kc,ca,cb->ab", weight, given.phi, given.phi), pull
 
 
 def log_density(

@@ -111,7 +111,9 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
             table_cells(batch, table[t] * table[t])
             _add_cells(batch, used, TABLE, fixed, s * tables + t)
         for a in range(scales if of_old > 0 else 0):
-            normal_cells(batch, s, f32((scale[a] * amplitudes.model) ** 2), amplitudes.bad_share)
+            normal_cells(
+                batch, s, f32(scale[a] ** 2 * (amplitudes.model**2 + amplitudes.wave**2)), amplitudes.bad_share
+            )
             _add_cells(batch, used, OLD, old, s * scales + a)
         kept = new_cells
         for c in range(used if of_new > 0 else 0):

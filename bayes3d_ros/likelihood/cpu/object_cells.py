@@ -8,7 +8,7 @@ The densities are those of `likelihood/slow_shared_errors.py`, written again in 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayes3d_ros.likelihood.cpu.buffers import f32, u64
 from bayes3d_ros.likelihood.cpu.cells import LOG_HALF, NO_MODE, bad_mode
@@ -33,6 +33,13 @@ class ObjectCells(NamedTuple):
     number: Float[np.ndarray, "M"]  # of returns
     x: Float[np.ndarray, "M"]  # metres from the middle
     y: Float[np.ndarray, "M"]
+    left: Int[np.ndarray, "M"]  # which cell is in the block to the left, and above; -1: none
+    above: Int[np.ndarray, "M"]
+    alike_left: Float[np.ndarray, "M"]  # correlation of the waves with that cell's, 0 where there is none
+    alike_above: Float[np.ndarray, "M"]
+    alike_both: Float[np.ndarray, "M"]  # of the one on the left with the one above
+    told: Float[np.ndarray, "M"]  # worked in: 1 / variance with which a good cell tells of the waves,
+    told_place: Float[np.ndarray, "M"]  # and where it says they are, metres, with the error that the object shares
 
 
 @allocating
@@ -43,6 +50,13 @@ def new_object_cells(pairs, most):
         np.zeros(2 * pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
+        np.zeros(most, np.float32),
+        np.zeros(most, np.float32),
+        np.zeros(most, np.float32),
+        np.zeros(most, np.float32),
+        np.zeros(most, np.float32),
+        np.zeros(most, np.int64),
+        np.zeros(most, np.int64),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
@@ -65,6 +79,33 @@ def place_cells(cells, count, metres):
         cells.x[c] = (cells.column[c] - column) * metres
         cells.y[c] = (cells.row[c] - row) * metres
     return column, row
+
+
+@strict
+def find_neighbours(cells, count, block, length):
+    """Which cells are beside which, and how alike their waves are. Cells are in the order of their blocks, rows of
+    blocks from the top. block: pixels a side; length: of waves, metres."""
+    above = 0
+    for c in range(count):
+        row, column = cells.row[c] // block, cells.column[c] // block
+        while above < c and (
+            cells.row[above] // block < row - 1
+            or (cells.row[above] // block == row - 1 and cells.column[above] // block < column)
+        ):
+            above += 1
+        has_above = above < c and cells.row[above] // block == row - 1 and cells.column[above] // block == column
+        has_left = c > 0 and cells.row[c - 1] // block == row and cells.column[c - 1] // block == column - 1
+        cells.above[c] = above if has_above else -1
+        cells.left[c] = c - 1 if has_left else -1
+        cells.alike_left[c] = _alike(cells, c, c - 1, length) if has_left else f32(0)
+        cells.alike_above[c] = _alike(cells, c, above, length) if has_above else f32(0)
+        cells.alike_both[c] = _alike(cells, c - 1, above, length) if has_left and has_above else f32(0)
+
+
+@strict
+def _alike(cells, one, other, length):
+    x, y = cells.x[one] - cells.x[other], cells.y[one] - cells.y[other]
+    return exp(-np.sqrt(x * x + y * y) / length)
 
 
 @fast
@@ -92,13 +133,13 @@ def reference_height(cells, s, most, count):
 
 
 @fast
-def _pass(cells, s, most, count, a, variance, share, sums):
+def _pass(cells, s, most, count, a, variance, waves, share, sums):
     """Sums over an object's cells given its shared error a: what the good ones tell of it, information (6) and pull
-    (3); and their logs, relative to `reference_height`, for three shares of bad ones."""
+    (3); and their logs, relative to `reference_height`, for three shares of bad ones. waves: their variance."""
     first, at = u64(2 * s * most), u64(s * most)
     second = first + u64(most)
     height, place, curvature, outliers, bad = cells.height, cells.place, cells.curvature, cells.outliers, cells.bad
-    xs, ys = cells.x, cells.y
+    xs, ys, told, told_place = cells.x, cells.y, cells.told, cells.told_place
     a0, a1, a2 = f32(a[0]), f32(a[1]), f32(a[2])
     few, middle, many = (
         min(share * _SPREADS[0], f32(0.9)),
@@ -109,9 +150,24 @@ def _pass(cells, s, most, count, a, variance, share, sums):
     b, bx, by = f32(0.0), f32(0.0), f32(0.0)
     log_few, log_middle, log_many = f32(0.0), f32(0.0), f32(0.0)
     for c in range(u64(count)):
-        x, y = xs[c], ys[c]
-        mean = a0 + a1 * x + a2 * y
-        spread, other_spread = f32(1.0) + curvature[first + c] * variance, f32(1.0) + curvature[second + c] * variance
+        # What the waves are in this cell, as the good ones to the left and above tell.
+        constant, x, y, known, left_free = f32(1.0), xs[c], ys[c], f32(0.0), waves
+        if waves > f32(0.0):
+            left, above = u64(max(cells.left[c], 0)), u64(max(cells.above[c], 0))
+            alike_left, alike_above, alike_both = cells.alike_left[c], cells.alike_above[c], cells.alike_both[c]
+            of_left = f32(1.0) + f32(1.0) / (waves * (told[left] + f32(1e-6))) if cells.left[c] >= 0 else f32(1.0)
+            of_above = f32(1.0) + f32(1.0) / (waves * (told[above] + f32(1e-6))) if cells.above[c] >= 0 else f32(1.0)
+            determinant = of_left * of_above - alike_both * alike_both
+            part_left = (alike_left * of_above - alike_above * alike_both) / determinant
+            part_above = (alike_above * of_left - alike_left * alike_both) / determinant
+            left_free = waves * (f32(1.0) - part_left * alike_left - part_above * alike_above)
+            constant -= part_left + part_above
+            x -= part_left * xs[left] + part_above * xs[above]
+            y -= part_left * ys[left] + part_above * ys[above]
+            known = part_left * told_place[left] + part_above * told_place[above]
+        mean = known + a0 * constant + a1 * x + a2 * y
+        here = variance + left_free
+        spread, other_spread = f32(1.0) + curvature[first + c] * here, f32(1.0) + curvature[second + c] * here
         precision, other_precision = curvature[first + c] / spread, curvature[second + c] / other_spread
         off, other_off = place[first + c] - mean, place[second + c] - mean
         one = height[first + c] - f32(0.5) * (log(spread) + off * off * precision)
@@ -125,18 +181,23 @@ def _pass(cells, s, most, count, a, variance, share, sums):
         log_middle += high + log(larger(total, f32(1e-37)))
         log_many += high + log(larger((f32(1.0) - many) * (e + other_e) + many * worse + none, f32(1e-37)))
         rest = (f32(1.0) - middle) / larger(total, f32(1e-37))
-        weight, other_weight = rest * e * precision, rest * other_e * other_precision
+        good, other_good = rest * e, rest * other_e
+        weight, other_weight = good * precision, other_good * other_precision
         both = weight + other_weight
-        pull = weight * place[first + c] + other_weight * place[second + c]
-        n += both
-        nx += both * x
-        ny += both * y
+        pull = weight * (place[first + c] - known) + other_weight * (place[second + c] - known)
+        n += both * constant * constant
+        nx += both * constant * x
+        ny += both * constant * y
         nxx += both * x * x
         nxy += both * x * y
         nyy += both * y * y
-        b += pull
+        b += pull * constant
         bx += pull * x
         by += pull * y
+        tells = good * curvature[first + c] / (f32(1.0) + curvature[first + c] * variance)
+        other_tells = other_good * curvature[second + c] / (f32(1.0) + curvature[second + c] * variance)
+        told[c] = tells + other_tells
+        told_place[c] = (tells * place[first + c] + other_tells * place[second + c]) / (told[c] + f32(1e-6))
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = n, nx, ny, nxx, nxy, nyy
     sums[6], sums[7], sums[8] = b, bx, by
     sums[9], sums[10], sums[11] = log_few, log_middle, log_many
@@ -169,11 +230,10 @@ def _log_of_shares(sums):
 @strict
 def _priors(scale, amplitudes):
     """Variances of an object's bias and slopes; 0 where it has no shared error."""
-    bias2, wave2 = (scale * amplitudes.bias) ** 2, (scale * amplitudes.wave) ** 2
-    slope2 = wave2 / (amplitudes.length * amplitudes.length) + (scale * amplitudes.lean) ** 2
+    bias2, slope2 = (scale * amplitudes.bias) ** 2, (scale * amplitudes.lean) ** 2
     if bias2 + slope2 == 0:
         return 0.0, 0.0
-    return max(bias2 + wave2, 1e-12), max(slope2, 1e-12)
+    return max(bias2, 1e-12), max(slope2, 1e-12)
 
 
 @strict
@@ -187,12 +247,13 @@ def _add_priors(sums, level, slope):
 def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
     """The mode of an object's shared error at one node, by reweighted steps, into a: bias (m), slopes along x and y."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
+    waves = f32((scale * amplitudes.wave) ** 2)
     level, slope = _priors(scale, amplitudes)
     a[0], a[1], a[2] = 0.0, 0.0, 0.0
     if level == 0:
         return
     for step in range(REWEIGHTED_STEPS):
-        _pass(cells, s, most, count, a, f32(variance + level) if step == 0 else variance, share, sums)
+        _pass(cells, s, most, count, a, f32(variance + level) if step == 0 else variance, waves, share, sums)
         _add_priors(sums, level, slope)
         a[0], a[1], a[2], _ = _solve(sums, sums[6:9])
 
@@ -203,7 +264,7 @@ def log_object(cells, s, most, count, scale, amplitudes, sums, a):
     out by a paraboloid about a, which is near the mode."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
     level, slope = _priors(scale, amplitudes)
-    _pass(cells, s, most, count, a, variance, share, sums)
+    _pass(cells, s, most, count, a, variance, f32((scale * amplitudes.wave) ** 2), share, sums)
     value = _log_of_shares(sums)
     if level == 0:
         return value

@@ -14,6 +14,7 @@ from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
 from bayes3d_ros.likelihood.cpu.object_cells import (
     begin_object,
+    find_neighbours,
     find_shared_error,
     log_object,
     new_object_cells,
@@ -115,6 +116,7 @@ def _gain_of(
     error, most = sums[12:15], len(own.column)
     if new_cells > 0:
         column, row = place_cells(own, new_cells, metres)
+        find_neighbours(own, new_cells, block, f32(amplitudes.length))
         for s in range(len(sigma)):
             begin_object(own, s, most, new_cells, amplitudes.bad_share)
         # One paraboloid for all nodes: about the mode at the middle one.
