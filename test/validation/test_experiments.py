@@ -170,9 +170,13 @@ def test_an_unknown_thing_is_found_for_no_type(rows):
     unknown = replace(
         estimate("unknown", pose((0.1, 0, 0.8))), size=np.array(SIZE), size_sigma=np.zeros(3), contact_face=-1
     )
-    frame, missed, false = rows([TrueObject("block", pose((0.1, 0, 0.8)), 1.0)], [unknown])
-    assert (frame["found"], frame["false"]) == (0, 1)
-    assert not missed["found"] and (false["what"], false["type"]) == ("false object", "unknown")
+    every = rows([TrueObject("block", pose((0.1, 0, 0.8)), 1.0)], [unknown])
+    frame, missed, thing = every
+    assert (frame["found"], frame["false"], frame["unknown"]) == (0, 0, 1)
+    assert not missed["found"] and (thing["what"], thing["type"]) == ("unknown thing", "unknown")
+    assert "0 of 1 found, 1 unknown" in parsing.line(frame) and "FALSE" not in parsing.line(thing)
+    total = parsing.summary(every)["library_10"]
+    assert (total["false_objects"], total["unknown_things"]) == (0, 1)
 
 
 def test_centres_of_boxes_are_compared_not_origins_of_meshes(rows):

@@ -18,7 +18,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior
@@ -80,7 +80,7 @@ def count(quick: bool) -> int:
 
 
 def steps(quick: bool) -> Iterator[Step]:
-    """The rows of every frame: one for the frame, one for every true object, one for every false one."""
+    """The rows of every frame: one for the frame, and one for every true object, false one and unknown thing."""
     chosen = recordings(quick)
     surfaces = Surfaces()
     for types in dict.fromkeys(recording.types for recording in chosen):
@@ -138,23 +138,25 @@ def frame_rows(
     """Rows of a parsed frame; `where` starts every one of them, surfaces(type) are points on its surface in its frame.
 
     A true object is found if an estimate of its type has its box's centre within match_objects' distance, or, where
-    there is no true pose, if there is an estimate of its type; estimates that stand for no true object are false.
+    there is no true pose, if there is an estimate of its type; estimates that stand for no true object are false, or
+    unknown things: truths list objects of types alone.
     """
     partner = _partners(true, posterior.objects, library)
     rows = []
     for i, thing in enumerate(true):
         estimate = posterior.objects[partner[i]] if i in partner else None
         rows.append(where | {"what": "object", **_object_row(thing, estimate, surfaces)})
-    false = [k for k in range(len(posterior.objects)) if k not in partner.values()]
-    for k in false:
-        estimate = posterior.objects[k]
+    others = [estimate for k, estimate in enumerate(posterior.objects) if k not in partner.values()]
+    for estimate in others:
         numbers = {**_sureness(estimate), "position": [round(float(v), 6) for v in estimate.position]}
-        rows.append(where | {"what": "false object", "type": estimate.type, **numbers})
+        what = "unknown thing" if estimate.type == UNKNOWN else "false object"
+        rows.append(where | {"what": what, "type": estimate.type, **numbers})
     frame = {
         "what": "frame",
         "objects": len(true),
         "found": len(partner),
-        "false": len(false),
+        "false": sum(estimate.type != UNKNOWN for estimate in others),
+        "unknown": sum(estimate.type == UNKNOWN for estimate in others),
         "num_objects": {str(n): round(float(p), 6) for n, p in posterior.num_objects.items()},
         "probability_of_count": round(float(posterior.num_objects.get(len(true), 0.0)), 6),
         "seconds": round(posterior.seconds, 4),
@@ -167,7 +169,7 @@ def frame_rows(
 
 def failed_rows(where: Row, true: Sequence[TrueObject], error: str) -> list[Row]:
     """Rows of a frame that could not be parsed: every object of it is missed."""
-    frame = {"what": "frame", "objects": len(true), "found": 0, "false": 0, "num_objects": {}}
+    frame = {"what": "frame", "objects": len(true), "found": 0, "false": 0, "unknown": 0, "num_objects": {}}
     frame |= {"probability_of_count": 0.0, "seconds": None, "ess_min": None, "noise_sigma": None, "error": error}
     rows = [where | {"what": "object", **_object_row(thing, None, Surfaces())} for thing in true]
     return [where | frame, *rows]
@@ -231,9 +233,11 @@ def line(row: Row) -> str:
             return f"{name}{row['error']}"
         counted = f"p(n={row['objects']}) {row['probability_of_count']:.2f}"
         extra = f", {row['false']} FALSE" if row["false"] else ""
+        extra += f", {row['unknown']} unknown" if row["unknown"] else ""
         done = f"{row['found']} of {row['objects']} found{extra}"
         return f"{name}{done}   {counted}   ESS >= {row['ess_min']:.3f}   {row['seconds']:.2f} s"
-    kind = "  FALSE" if row["what"] == "false object" else "  " if row["found"] else "  MISSED"
+    others = {"false object": "  FALSE", "unknown thing": "  "}
+    kind = others.get(row["what"]) or ("  " if row["found"] else "  MISSED")
     numbers = (
         ("visible_fraction", 1, "7.2f"), ("probability", 1, "9.3f"), ("type_probability", 1, "8.3f"),
         ("add_s", 1e3, "8.2f"), ("position_error", 1e3, "7.2f"),
@@ -266,6 +270,7 @@ def _totals(rows: list[Row]) -> Row:
         "objects": len(objects),
         "found": sum(row["found"] for row in objects),
         "false_objects": sum(row["what"] == "false object" for row in rows),
+        "unknown_things": sum(row["what"] == "unknown thing" for row in rows),
         "worst_add_s_half_visible": max(seen, default=None),
         "median_add_s": _median(row["add_s"] for row in told),
         "covered_95": f"{sum(row['covered'] for row in told)} of {len(told)}",
@@ -277,7 +282,7 @@ def _sugar_box(rows: list[Row]) -> Row | None:
     box = next((row for row in rows if row["what"] == "object"), None)
     if box is None:
         return None
-    listed = sum(row["what"] == "false object" for row in rows) + bool(box["found"])
+    listed = sum(row["what"] in ("false object", "unknown thing") for row in rows) + bool(box["found"])
     keys = ("found", "probability", "type_probability", "add_s", "sigma", "distance", "outside")
     return {"listed_objects": listed, **{key: box[key] for key in keys}}
 

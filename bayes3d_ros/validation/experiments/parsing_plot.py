@@ -17,8 +17,8 @@ from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot
 
 LIMIT_MM = 10.0  # ADD-S that is asked for where at least half of an object is visible
 COLUMNS = (
-    *((0.0, "recording"), (0.35, "types"), (0.45, "frames"), (0.57, "found")),
-    *((0.72, "false"), (0.82, "p(n)"), (0.94, "s")),
+    *((0.0, "recording"), (0.32, "types"), (0.41, "frames"), (0.52, "found")),
+    *((0.64, "false"), (0.73, "unknown"), (0.85, "p(n)"), (0.94, "s")),
 )
 FAILED = "#B22222"
 
@@ -105,9 +105,10 @@ def _recordings(axis: Axes, rows: Sequence[Row]) -> None:
         seconds = [row["seconds"] for row in own if row["seconds"] is not None]
         words = (
             bag, str(library), str(len(own)), f"{found} of {true}", str(false),
+            str(sum(row["unknown"] for row in own)),
             f"{min(row['probability_of_count'] for row in own):.2f}", f"{max(seconds):.1f}" if seconds else "-",
         )  # fmt: skip
-        wrong = (False, False, False, found < true, false > 0, False, False)
+        wrong = (False, False, False, found < true, false > 0, False, False, False)
         for (x, _), text, bad in zip(COLUMNS, words, wrong, strict=True):
             axis.text(x, 0.95 - step * (k + 1), text, fontsize=9.5, color=FAILED if bad else INK, va="top")
 
