@@ -10,6 +10,7 @@ import pytest
 from scipy.special import logsumexp
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.likelihood import slow_cells, slow_object_cells
 from bayes3d_ros.likelihood import slow_shared_errors as slow
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Noise
 from bayes3d_ros.likelihood.image_model import gain, log_marginal, shared_errors
@@ -37,14 +38,14 @@ def cells(residuals, lost=0.0):
     k = np.arange(len(residual))
     middle = 3.0 * np.stack([k % 6, k // 6], 1)
     label = np.full(len(residual), slow.OBJECT)
-    return slow.SurfaceCells(
+    return slow_cells.SurfaceCells(
         residual, whole, OUTLIER * whole, lost * whole, whole > 0, label, middle, np.full((len(residual), 4), -np.inf)
     )
 
 
 def _log_object(residuals, errors):
-    found = slow.modes(cells(residuals), SIGMA, P)
-    return slow.log_object(cells(residuals), found, 0, 1.0, errors, 0.005)
+    found = slow_cells.modes(cells(residuals), SIGMA, P)
+    return slow_object_cells.log_object(cells(residuals), found, 0, 1.0, errors, 0.005)
 
 
 def by_quadrature(residual, sd, mean=0.0):
@@ -61,14 +62,14 @@ def by_quadrature(residual, sd, mean=0.0):
 def test_a_cell_is_its_integral_over_the_offset(count, offset, sd):
     rng = np.random.default_rng(count)
     residual = offset + SIGMA * rng.normal(size=count)
-    found = slow.modes(cells(residual), SIGMA, P).normal(0.0, sd)[0]
+    found = slow_cells.modes(cells(residual), SIGMA, P).normal(0.0, sd)[0]
     assert found == pytest.approx(by_quadrature(residual, sd), abs=0.1)
 
 
 def test_a_cell_with_two_surfaces_counts_both_modes():
     residual = np.array([0.0002, -0.0005, 0.0003, 0.0001, 0.0203, 0.0198, 0.0201, 0.0206, 0.0199])
     for sd in (0.001, 0.01):
-        assert slow.modes(cells(residual), SIGMA, P).normal(0.0, sd)[0] == pytest.approx(
+        assert slow_cells.modes(cells(residual), SIGMA, P).normal(0.0, sd)[0] == pytest.approx(
             by_quadrature(residual, sd), abs=0.1
         )
 

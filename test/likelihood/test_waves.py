@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from bayes3d_ros.likelihood import slow_shared_errors as slow
+from bayes3d_ros.likelihood import slow_cells
+from bayes3d_ros.likelihood import slow_object_cells as slow
+from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT
 
 WAVES, LENGTH, METRES = 0.0015**2, 0.05, 0.005  # variance, m; a pixel
 MODEL = 0.001**2
@@ -14,22 +16,22 @@ NOISE = 0.0004**2  # of a cell's mode
 BLOCK = 3
 
 
-def _cells(columns: int, rows: int) -> tuple[slow.SurfaceCells, np.ndarray]:
+def _cells(columns: int, rows: int) -> tuple[slow_cells.SurfaceCells, np.ndarray]:
     """A grid of cells of one object, as blocks are numbered, and 1, x, y of each."""
     row, column = (a.ravel() for a in np.indices((rows, columns)))
     middle = np.stack([BLOCK * column + 1.0, BLOCK * row + 1.0], 1)
     one = np.ones((len(middle), 1))
-    label = np.full(len(middle), slow.OBJECT)
-    cells = slow.SurfaceCells(one, one, one, one, one > 0, label, middle, np.full((len(middle), 1), -np.inf))
+    label = np.full(len(middle), OBJECT)
+    cells = slow_cells.SurfaceCells(one, one, one, one, one > 0, label, middle, np.full((len(middle), 1), -np.inf))
     return cells, np.column_stack([one, METRES * (middle - middle.mean(0))])
 
 
-def _modes(place: np.ndarray, variance: float) -> slow.CellModes:
+def _modes(place: np.ndarray, variance: float) -> slow_cells.CellModes:
     """Cells that are off by this, up to this variance, and no outliers."""
     none = np.full(len(place), -np.inf)
     height = np.stack([np.zeros(len(place)), none])
     curvature = np.full((2, len(place)), 1 / variance)
-    return slow.CellModes(height, np.stack([place, place]), curvature, none)
+    return slow_cells.CellModes(height, np.stack([place, place]), curvature, none)
 
 
 def _log_density(place, phi, cells, variance, model):

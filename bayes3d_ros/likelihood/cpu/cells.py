@@ -3,7 +3,7 @@
 """Cells of pixels that share an error, many side by side: how likely their returns are as a function of it, and summed
 over it. What an object's cells say together is in `object_cells.py`.
 
-The densities are those of `likelihood/slow_shared_errors.py`, written again in scalars; tests compare.
+The densities are those of `likelihood/slow_cells.py`, written again in scalars; tests compare.
 """
 
 from typing import NamedTuple

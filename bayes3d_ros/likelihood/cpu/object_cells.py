@@ -2,7 +2,7 @@
 
 """The cells of one object: how likely they are together, the error that they share integrated out.
 
-The densities are those of `likelihood/slow_shared_errors.py`, written again in scalars; tests compare.
+The densities are those of `likelihood/slow_object_cells.py`, written again in scalars; tests compare.
 """
 
 from typing import NamedTuple

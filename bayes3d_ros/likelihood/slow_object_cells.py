@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The cells of one object, in float64 and as `shared_errors.py` says it: how likely they are together, the error that
+they share integrated out and each given the waves in those beside it. The reference of `cpu/object_cells.py`."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import logsumexp
+
+from bayes3d_ros.likelihood.shared_errors import BAD_SPREAD, BAD_WEIGHT, REWEIGHTED_STEPS, SharedErrorImage
+from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells
+
+
+class Neighbours(NamedTuple):
+    """Of C cells of one object: the one in the block to the left and the one above (-1: none), and the correlations of
+    the object's waves with them, and between the two."""
+
+    left: Int[np.ndarray, "C"]
+    above: Int[np.ndarray, "C"]
+    alike: Float[np.ndarray, "C 3"]  # with the left one, with the one above, of the two with each other
+
+
+def neighbours(cells: SurfaceCells, phi: Float[np.ndarray, "C 3"], block: int, length: float) -> Neighbours:
+    """phi: 1, x and y of each cell, metres; block: pixels a side; length: of the waves, metres."""
+    at = {tuple(place): c for c, place in enumerate((cells.middle // block).astype(int).tolist())}
+
+    def alike(one: int, other: int) -> float:
+        return float(np.exp(-np.hypot(*(phi[one] - phi[other])[1:]) / length)) if min(one, other) >= 0 else 0.0
+
+    left = [at.get((column - 1, row), -1) for column, row in at]
+    above = [at.get((column, row - 1), -1) for column, row in at]
+    correlations = [
+        (alike(c, one), alike(c, up), alike(one, up)) for c, (one, up) in enumerate(zip(left, above, strict=True))
+    ]
+    return Neighbours(np.array(left, int), np.array(above, int), np.array(correlations).reshape(-1, 3))
+
+
+class CellsGivenOthers(NamedTuple):
+    """What C cells are off given the error that the object shares and the cells to their left and above: normal, with
+    mean `known` + `phi` a and this variance."""
+
+    known: Float[np.ndarray, "C"]  # metres
+    phi: Float[np.ndarray, "C 3"]
+    variance: Float[np.ndarray, "C"]
+
+
+def given_others(
+    found: CellModes, phi, a, model: float, waves: float, beside: Neighbours, share: float, bad
+) -> CellsGivenOthers:
+    """Vecchia's approximation of waves with correlation exp(-distance / length): each cell given those to its left and
+    above, as far as these are good. model, waves: variances of a cell's own error and of the waves; share: of bad
+    cells; bad: what they say."""
+    count = len(phi)
+    told, told_place = np.zeros(count), np.zeros(count)
+    given = CellsGivenOthers(np.zeros(count), phi.copy(), np.full(count, model + waves))
+    for c in range(count):
+        others = np.array([k for k in (beside.left[c], beside.above[c]) if k >= 0], int)
+        if waves > 0 and len(others):
+            with_left, with_above, both = beside.alike[c]
+            alike = np.array([r for r, k in ((with_left, beside.left[c]), (with_above, beside.above[c])) if k >= 0])
+            between = np.array([[1.0, both], [both, 1.0]])[: len(others), : len(others)]
+            uncertain = 1 / (waves * (told[others] + 1e-6))
+            part = np.linalg.solve(between + np.diag(uncertain), alike)
+            given.known[c] = part @ told_place[others]
+            given.phi[c] -= part @ phi[others]
+            given.variance[c] = model + waves * (1 - part @ alike)
+        mean = given.known[c] + given.phi[c] @ a
+        spread = 1 + found.curvature[:, c] * given.variance[c]
+        apart = (found.place[:, c] - mean) ** 2 * found.curvature[:, c] / spread
+        modes = np.log1p(-share) + found.height[:, c] - 0.5 * np.log(spread) - 0.5 * apart
+        with np.errstate(divide="ignore"):
+            total = logsumexp([*modes, np.log1p(-share) + found.outliers[c], np.log(share) + bad[c]])
+        tells = np.exp(modes - total) * found.curvature[:, c] / (1 + found.curvature[:, c] * model)
+        told[c] = tells.sum()
+        told_place[c] = tells @ found.place[:, c] / (told[c] + 1e-6)
+    return given
+
+
+def log_object(
+    cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
+) -> float:
+    """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
+    three reweighted steps. found: the cells' modes at the node."""
+    amplitudes = errors.amplitudes
+    share, model = float(amplitudes.bad_share), (scale * float(amplitudes.model)) ** 2
+    waves = (scale * float(amplitudes.wave)) ** 2
+    bad = found.bad(cells.own_plane[:, node])
+    middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
+    phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
+    beside = neighbours(cells, phi, int(errors.block), float(amplitudes.length))
+
+    def log_cells(given: CellsGivenOthers, share: float):
+        mean = given.known + given.phi @ a
+        with np.errstate(divide="ignore"):
+            good = np.log1p(-share) + found.normal(mean, np.sqrt(given.variance))
+            return np.logaddexp(good, np.log(share) + bad).sum()
+
+    a = np.zeros(3)
+    bias2, slope2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.lean)) ** 2
+    prior = np.maximum([bias2, slope2, slope2], 1e-12)
+    for step in range(REWEIGHTED_STEPS if bias2 + slope2 > 0 else 0):
+        given = given_others(found, phi, a, model + prior[0] if step == 0 else model, waves, beside, share, bad)
+        information, pull = _information(found, given, a, share, bad)
+        a = np.linalg.solve(information + np.diag(1 / prior), pull)
+    given = given_others(found, phi, a, model, waves, beside, share, bad)
+    shares = [min(share * b, 0.9) for b in BAD_SPREAD]
+    log_all = logsumexp([log_cells(given, s) + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
+    if bias2 + slope2 == 0:
+        return log_all
+    information, pull = _information(found, given, a, share, bad)
+    full = information + np.diag(1 / prior)
+    slope = pull - full @ a
+    return (
+        log_all
+        - 0.5 * (a**2 / prior).sum()
+        - 0.5 * np.log(prior).sum()
+        - 0.5 * np.linalg.slogdet(full)[1]
+        + 0.5 * slope @ np.linalg.solve(full, slope)
+    )
+
+
+def _information(found: CellModes, given: CellsGivenOthers, a, share: float, bad):
+    """What the good cells tell of a: responsibilities of modes, given a."""
+    mean = given.known + given.phi @ a
+    spread = 1 + found.curvature * given.variance
+    term = found.height - 0.5 * np.log(spread) - 0.5 * (found.place - mean) ** 2 * found.curvature / spread
+    with np.errstate(divide="ignore"):
+        total = np.logaddexp(np.log1p(-share) + found.normal(mean, np.sqrt(given.variance)), np.log(share) + bad)
+    weight = np.exp(np.log1p(-share) + term - total) * found.curvature / spread
+    pull = np.einsum("kc,kc,ca->a", weight, found.place - given.known, given.phi)
+    return np.einsum("kc,ca,cb->ab", weight, given.phi, given.phi), pull
