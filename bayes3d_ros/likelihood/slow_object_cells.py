@@ -44,6 +44,7 @@ class CellsGivenOthers(NamedTuple):
     known: Float[np.ndarray, "C"]  # metres
     phi: Float[np.ndarray, "C 3"]
     variance: Float[np.ndarray, "C"]
+    good: Float[np.ndarray, "2 C"]  # probability of each mode of each cell, as a good one's
 
 
 def given_others(
@@ -54,7 +55,7 @@ def given_others(
     cells; bad: what they say."""
     count = len(phi)
     told, told_place = np.zeros(count), np.zeros(count)
-    given = CellsGivenOthers(np.zeros(count), phi.copy(), np.full(count, model + waves))
+    given = CellsGivenOthers(np.zeros(count), phi.copy(), np.full(count, model + waves), np.zeros((2, count)))
     for c in range(count):
         others = np.array([k for k in (beside.left[c], beside.above[c]) if k >= 0], int)
         if waves > 0 and len(others):
@@ -72,7 +73,8 @@ def given_others(
         modes = np.log1p(-share) + found.height[:, c] - 0.5 * np.log(spread) - 0.5 * apart
         with np.errstate(divide="ignore"):
             total = logsumexp([*modes, np.log1p(-share) + found.outliers[c], np.log(share) + bad[c]])
-        tells = np.exp(modes - total) * found.curvature[:, c] / (1 + found.curvature[:, c] * model)
+        given.good[:, c] = np.exp(modes - total)
+        tells = given.good[:, c] * found.curvature[:, c] / (1 + found.curvature[:, c] * model)
         told[c] = tells.sum()
         told_place[c] = tells @ found.place[:, c] / (told[c] + 1e-6)
     return given
@@ -102,14 +104,14 @@ def log_object(
     prior = np.maximum([bias2, slope2, slope2], 1e-12)
     for step in range(REWEIGHTED_STEPS if bias2 + slope2 > 0 else 0):
         given = given_others(found, phi, a, model + prior[0] if step == 0 else model, waves, beside, share, bad)
-        information, pull = _information(found, given, a, share, bad)
+        information, pull = _information(found, given)
         a = np.linalg.solve(information + np.diag(1 / prior), pull)
     given = given_others(found, phi, a, model, waves, beside, share, bad)
     shares = [min(share * b, 0.9) for b in BAD_SPREAD]
     log_all = logsumexp([log_cells(given, s) + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
     if bias2 + slope2 == 0:
         return log_all
-    information, pull = _information(found, given, a, share, bad)
+    information, pull = _information(found, given)
     full = information + np.diag(1 / prior)
     slope = pull - full @ a
     return (
@@ -121,13 +123,8 @@ def log_object(
     )
 
 
-def _information(found: CellModes, given: CellsGivenOthers, a, share: float, bad):
-    """What the good cells tell of a: responsibilities of modes, given a."""
-    mean = given.known + given.phi @ a
-    spread = 1 + found.curvature * given.variance
-    term = found.height - 0.5 * np.log(spread) - 0.5 * (found.place - mean) ** 2 * found.curvature / spread
-    with np.errstate(divide="ignore"):
-        total = np.logaddexp(np.log1p(-share) + found.normal(mean, np.sqrt(given.variance)), np.log(share) + bad)
-    weight = np.exp(np.log1p(-share) + term - total) * found.curvature / spread
+def _information(found: CellModes, given: CellsGivenOthers):
+    """What the good cells tell of the error that the object shares."""
+    weight = given.good * found.curvature / (1 + found.curvature * given.variance)
     pull = np.einsum("kc,kc,ca->a", weight, found.place - given.known, given.phi)
     return np.einsum("kc,ca,cb->ab", weight, given.phi, given.phi), pull
