@@ -106,10 +106,6 @@ def _blocks_of(image: ScoredImage, v, u, spread, outlier, block: int) -> _Blocks
     y = (gathered(v) - centre[:, 1:]) * metres[:, 1:]
     norm2 = 1 + np.asarray(image.ray_x, np.float64)[u] ** 2 + np.asarray(image.ray_y, np.float64)[v] ** 2
 
-    def at(wanted: np.ndarray, there: np.ndarray) -> np.ndarray:
-        place = np.minimum(np.searchsorted(number, wanted), len(number) - 1)
-        return np.where(there & (number[place] == wanted), place, -1)
-
     return _Blocks(
         real,
         np.where(real, z - middle[:, None], 0.0),
@@ -120,8 +116,21 @@ def _blocks_of(image: ScoredImage, v, u, spread, outlier, block: int) -> _Blocks
         centre,
         metres,
         which,
-        np.stack([at(number - 1, number % across > 0), at(number - across, number >= across)]),
+        blocks_beside(number % across, number // across),
     )
+
+
+def blocks_beside(column: Int[np.ndarray, "C"], row: Int[np.ndarray, "C"]) -> Int[np.ndarray, "2 C"]:
+    """Which block is to the left of each, and which above; -1: none. Blocks are in the order of their rows, and of
+    their columns within a row."""
+    across = int(column.max(initial=0)) + 2  # a column between the end of a row and the next one's beginning
+    number = row * across + column
+
+    def at(wanted: np.ndarray) -> np.ndarray:
+        place = np.minimum(np.searchsorted(number, wanted), len(number) - 1)
+        return np.where(number[place] == wanted, place, -1)
+
+    return np.stack([at(number - 1), at(number - across)])
 
 
 def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray, "C"]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import logsumexp
 
+from bayes3d_ros.likelihood.own_plane import blocks_beside
 from bayes3d_ros.likelihood.shared_errors import BAD_SPREAD, BAD_WEIGHT, REWEIGHTED_STEPS, SharedErrorImage
 from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells
 
@@ -24,17 +25,15 @@ class Neighbours(NamedTuple):
 
 def neighbours(cells: SurfaceCells, phi: Float[np.ndarray, "C 3"], block: int, length: float) -> Neighbours:
     """phi: 1, x and y of each cell, metres; block: pixels a side; length: of the waves, metres."""
-    at = {tuple(place): c for c, place in enumerate((cells.middle // block).astype(int).tolist())}
+    left, above = blocks_beside(*(cells.middle // block).astype(int).T)
 
-    def alike(one: int, other: int) -> float:
-        return float(np.exp(-np.hypot(*(phi[one] - phi[other])[1:]) / length)) if min(one, other) >= 0 else 0.0
+    def alike(one: Int[np.ndarray, "C"], other: Int[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+        apart = np.hypot(*(phi[one] - phi[other])[:, 1:].T)
+        return np.where((one >= 0) & (other >= 0), np.exp(-apart / length), 0.0)
 
-    left = [at.get((column - 1, row), -1) for column, row in at]
-    above = [at.get((column, row - 1), -1) for column, row in at]
-    correlations = [
-        (alike(c, one), alike(c, up), alike(one, up)) for c, (one, up) in enumerate(zip(left, above, strict=True))
-    ]
-    return Neighbours(np.array(left, int), np.array(above, int), np.array(correlations).reshape(-1, 3))
+    left, above = blocks_beside(*(cells.middle // block).astype(int).T)
+    itself = np.arange(len(phi))
+    return Neighbours(left, above, np.stack([alike(itself, left), alike(itself, above), alike(left, above)], 1))
 
 
 class CellsGivenOthers(NamedTuple):
