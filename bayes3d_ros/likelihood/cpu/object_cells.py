@@ -33,11 +33,12 @@ class ObjectCells(NamedTuple):
     number: Float[np.ndarray, "M"]  # of returns
     x: Float[np.ndarray, "M"]  # metres from the middle
     y: Float[np.ndarray, "M"]
-    left: Int[np.ndarray, "M"]  # which cell is in the block to the left, and above; -1: none
-    above: Int[np.ndarray, "M"]
-    alike_left: Float[np.ndarray, "M"]  # correlation of the waves with that cell's, 0 where there is none
-    alike_above: Float[np.ndarray, "M"]
-    alike_both: Float[np.ndarray, "M"]  # of the one on the left with the one above
+    above: Int[
+        np.ndarray, "M"
+    ]  # which cell is in the block above; 0 where none is. The one to the left is the last one
+    alike_left: Float[np.ndarray, "M"]  # correlation of the waves with those of the cell to the left, 0 where none is,
+    alike_above: Float[np.ndarray, "M"]  # and with those of the one above
+    alike_both: Float[np.ndarray, "M"]  # of these two with each other
     told: Float[np.ndarray, "M"]  # worked in: 1 / variance with which a good cell tells of the waves,
     told_place: Float[np.ndarray, "M"]  # and where it says they are, metres, with the error that the object shares
 
@@ -55,7 +56,6 @@ def new_object_cells(pairs, most):
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
-        np.zeros(most, np.int64),
         np.zeros(most, np.int64),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
@@ -95,8 +95,7 @@ def find_neighbours(cells, count, block, length):
             above += 1
         has_above = above < c and cells.row[above] // block == row - 1 and cells.column[above] // block == column
         has_left = c > 0 and cells.row[c - 1] // block == row and cells.column[c - 1] // block == column - 1
-        cells.above[c] = above if has_above else -1
-        cells.left[c] = c - 1 if has_left else -1
+        cells.above[c] = above if has_above else 0
         cells.alike_left[c] = _alike(cells, c, c - 1, length) if has_left else f32(0)
         cells.alike_above[c] = _alike(cells, c, above, length) if has_above else f32(0)
         cells.alike_both[c] = _alike(cells, c - 1, above, length) if has_left and has_above else f32(0)
@@ -153,10 +152,11 @@ def _pass(cells, s, most, count, a, variance, waves, share, sums):
         # What the waves are in this cell, as the good ones to the left and above tell.
         constant, x, y, known, left_free = f32(1.0), xs[c], ys[c], f32(0.0), waves
         if waves > f32(0.0):
-            left, above = u64(max(cells.left[c], 0)), u64(max(cells.above[c], 0))
             alike_left, alike_above, alike_both = cells.alike_left[c], cells.alike_above[c], cells.alike_both[c]
-            of_left = f32(1.0) + f32(1.0) / (waves * (told[left] + f32(1e-6))) if cells.left[c] >= 0 else f32(1.0)
-            of_above = f32(1.0) + f32(1.0) / (waves * (told[above] + f32(1e-6))) if cells.above[c] >= 0 else f32(1.0)
+            has_left, has_above = alike_left > f32(0.0), alike_above > f32(0.0)
+            left, above = c - u64(1) if has_left else u64(0), u64(cells.above[c])
+            of_left = f32(1.0) + f32(1.0) / (waves * (told[left] + f32(1e-6))) if has_left else f32(1.0)
+            of_above = f32(1.0) + f32(1.0) / (waves * (told[above] + f32(1e-6))) if has_above else f32(1.0)
             determinant = of_left * of_above - alike_both * alike_both
             part_left = (alike_left * of_above - alike_above * alike_both) / determinant
             part_above = (alike_above * of_left - alike_left * alike_both) / determinant
