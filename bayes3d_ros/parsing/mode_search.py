@@ -96,8 +96,8 @@ def narrow(
         value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
         value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
         weight = tempered(value, 5.0)
-        centred = offset - jnp.einsum("md,mda->ma", weight, offset)[:, None]
-        learned = jnp.einsum("md,mda,mdb->mab", weight, centred, centred)
+        # About where the draws came from: a mode that is still on its way is drawn out along it (Hansen 2016, CMA-ES).
+        learned = jnp.einsum("md,mda,mdb->mab", weight, offset, offset)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(SEARCH.smallest_spread) ** 2)
         covariance = 1.2 * learned + 0.05 * scale @ scale.swapaxes(1, 2) + floor
