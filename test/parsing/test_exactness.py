@@ -142,7 +142,7 @@ def test_pixels_that_count_in_part(seen, step):
     """The posterior of a weighted likelihood is enumerated like any other; it is wider."""
     context = seen.context._replace(image=seen.context.image._replace(weight=np.float32(0.4)))
     grid = for_image(noise_grid(SIGMA_MAX), context.image, SMALL_WINDOW)
-    part = seen._replace(context=context, grid=grid)
+    part = seen._replace(context=context, model=grid)
     log_z, mixed = sampled(part, step())
     log_truth, truth = enumerated(part)
     assert agrees(log_z, log_truth)

@@ -57,11 +57,11 @@ class Run(NamedTuple):
 def run(problem: SmallProblem, seed: int, particles: int = RUN_PARTICLES, step: Callable = smc.step) -> Run:
     """As many stages as the problem has true objects. All that is asked of the sampler stands here."""
     objects, key = len(problem.truth.type), jax.random.key(seed)
-    state = smc.init(problem.context, problem.grid, particles, problem.max_objects, problem.table_size, problem.window)
+    state = smc.init(problem.context, problem.model, particles, problem.max_objects, problem.table_size, problem.window)
     log_evidence = [0.0]
     for count in range(objects):
         state, _ = step(
-            jax.random.fold_in(key, count), state, jnp.int32(count), problem.context, problem.grid,
+            jax.random.fold_in(key, count), state, jnp.int32(count), problem.context, problem.model,
             problem.table_size, problem.window, ESS_THRESHOLD,
         )  # fmt: skip
         log_evidence.append(float(state.log_evidence))

@@ -21,9 +21,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
+from bayes3d_ros.likelihood.image_model import ImageModel, SharedErrors, empty_likelihood, gain, log_marginal
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
+from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES
 from bayes3d_ros.objects.placement import Placement, T_camera_object, log_prior
 from bayes3d_ros.parsing.context import Context
@@ -80,23 +81,31 @@ class Reference(NamedTuple):
 
 
 def bare_scene(problem: SmallProblem) -> GivenScene:
-    return _given_scene(problem, problem.context.image.bare_depth)
+    """The empty table."""
+    image, model = problem.context.image, problem.model
+    padded = pad_scene(image.bare_depth, problem.window)[None]
+    loglik_grid = empty_likelihood(model, padded, image, problem.window)
+    return GivenScene(padded, loglik_grid, log_marginal(model, loglik_grid))
 
 
 def with_object(problem: SmallProblem, placement: Placement) -> GivenScene:
-    """The table with one object, drawn and scored as a whole; placement [1]."""
+    """The table with one object, drawn and scored as a whole; placement [1]. Of pixels that err independently."""
     image, library, table = problem.context
     one = jax.tree.map(lambda a: a[0], single(placement))
     rays = jnp.meshgrid(image.ray_x, image.ray_y)
     depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
-    return _given_scene(problem, jnp.minimum(image.bare_depth, depth))
-
-
-def _given_scene(problem: SmallProblem, depth: Float[Array, "H W"]) -> GivenScene:
-    padded = pad_scene(depth, problem.window)[None]
-    loglik_grid = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
+    padded = pad_scene(jnp.minimum(image.bare_depth, depth), problem.window)[None]
+    grid = noise_grid_of(problem)
+    loglik_grid = log_likelihood_scene(padded, image, grid.coarse, problem.window)
     loglik_grid = loglik_grid - loglik_grid.max()
-    return GivenScene(padded, loglik_grid, log_marginal(loglik_grid, problem.grid))
+    return GivenScene(padded, loglik_grid, log_marginal(grid, loglik_grid))
+
+
+def noise_grid_of(problem: SmallProblem) -> NoiseGrid:
+    """The grid of noise of a problem whose pixels err independently."""
+    if not isinstance(problem.model, NoiseGrid):
+        raise TypeError(f"{problem.name}: expected pixels that err independently, got errors that they share")
+    return problem.model
 
 
 def yaw_cells(count: int) -> tuple[Float[np.ndarray, "count"], float]:
@@ -142,18 +151,18 @@ def single(placement: Placement) -> Placement:
 
 @partial(jax.jit, static_argnames="window")
 def _gains(
-    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+    placement: Placement, scene: GivenScene, context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N S P"]:
     nobody = jnp.zeros(placement.type.shape, jnp.int32)
-    return log_likelihood_gain(placement, nobody, scene.depth, *context, grid.coarse, window)
+    return gain(model, placement, nobody, scene.depth, context, window)[0]
 
 
 @partial(jax.jit, static_argnames="window")
 def _values(
-    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+    placement: Placement, scene: GivenScene, context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N"]:
-    gain = _gains(placement, scene, context, grid, window)
-    value = log_marginal(scene.loglik_grid + gain, grid) - scene.log_likelihood
+    gained = _gains(placement, scene, context, model, window)
+    value = log_marginal(model, scene.loglik_grid + gained) - scene.log_likelihood
     return value + log_prior(placement, context.library, context.table)
 
 
@@ -163,7 +172,7 @@ def _batched(function, problem: SmallProblem, scene: GivenScene, placement: Plac
 
     def batch(start: int) -> np.ndarray:
         some = take(placement, np.arange(start, start + BATCH) % count)
-        values = function(single(some), scene, problem.context, problem.grid, problem.window)
+        values = function(single(some), scene, problem.context, problem.model, problem.window)
         return np.asarray(values, np.float64)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -171,7 +180,7 @@ def _batched(function, problem: SmallProblem, scene: GivenScene, placement: Plac
 
 
 def all_gains(problem: SmallProblem, scene: GivenScene, placement: Placement) -> Float[np.ndarray, "N S P"]:
-    """Log likelihood that objects add to a scene, at every noise level of the coarse grid."""
+    """Log likelihood that objects add to a scene, at every node of the noise, or of the errors."""
     return _batched(_gains, problem, scene, placement)
 
 
