@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from bayes3d_ros.likelihood.image_model import ImageModel, SharedErrors, empty_likelihood, gain, log_marginal
+from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, log_marginal
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
