@@ -36,6 +36,8 @@ CELL = 0.015  # metres, at most, of the first cells
 # Level by level: how many nats below the best a cell may be to be halved, and the share of the mass that the lightest
 # cells may hold together to be left whole. Middles of cells wider than a mode understate its flanks.
 LEVELS = ((200.0, 0.0), (60.0, 0.0), (30.0, 1e-6), (30.0, 1e-4), (30.0, 1e-3), (30.0, 1e-3))
+# Where pixels share errors the noise is small, and the likelihood jumps by nats where pixels become edges: once more.
+SHARED_LEVELS = (*LEVELS, (30.0, 0.02))
 Levels = tuple[tuple[float, float], ...]
 # Nats that the last halving, and the one before it, may move the evidence by for it to stand still. Two, because moves
 # change sign: one can be small by chance.
@@ -187,13 +189,16 @@ def all_gains(problem: SmallProblem, scene: GivenScene, placement: Placement) ->
 def enumerate_object(
     problem: SmallProblem,
     scene: GivenScene | None = None,
-    levels: Levels = LEVELS,
+    levels: Levels | None = None,
     where: Where | None = None,
     cell: float = CELL,
 ) -> Reference:
     """The posterior of one object added to a scene (by default the empty table). The best cells are halved len(levels)
-    times, fewer once the evidence stands still. `where` leaves out cells of the first level."""
+    times, fewer once the evidence stands still; by default as the model needs. `where` leaves out cells of the first
+    level."""
     scene = bare_scene(problem) if scene is None else scene
+    if levels is None:
+        levels = LEVELS if isinstance(problem.model, NoiseGrid) else SHARED_LEVELS
     placement, width = all_cells(problem, cell)
     if where is not None:
         inside = where(placement)
