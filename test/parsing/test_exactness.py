@@ -165,6 +165,26 @@ def test_a_hidden_handle(hidden, hidden_exact, step):
     assert (yaw[arc] > true[arc] / 3).all()
 
 
+def test_errors_that_pixels_share():
+    """The model that is shipped, with its amplitudes: evidence and regions of a block."""
+    problem = PROBLEMS["block, shared"]()
+    found = enumerate_object(problem)
+    assert abs(found.log_evidence[-2] - found.log_evidence[-3]) < 0.02  # the last halving
+    assert abs(found.log_evidence[-1] - found.log_evidence[-2]) < 0.02  # random points of cells, not their middles
+    truth = found.marginals(problem)
+    runs = [run(problem, seed, PARTICLES) for seed in range(4)]
+    log_z = np.array([r.log_evidence[-1] for r in runs])
+    assert np.sqrt(np.mean((log_z - found.log_evidence[-1]) ** 2)) < 0.3
+    each = [run_marginals(problem, r) for r in runs]
+    weight = evidence_weights(log_z)
+    mixed = {name: weight @ np.array([getattr(m, name) for m in each]) for name in each[0]._fields}
+    assert total_variation(mixed["face"], truth.face) < 0.1
+    for name in ("x", "y", "yaw"):
+        assert total_variation(binned(name, mixed[name]), binned(name, getattr(truth, name))) < 0.1
+        width, mass = region_against(mixed[name], getattr(truth, name), 0.9)
+        assert 0.8 < width < 1.2 and 0.8 < mass < 0.97
+
+
 def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
     """Its regions are too wide and its marginals far from the exact ones, whatever the evidence."""
     rng, count = np.random.default_rng(0), 4000

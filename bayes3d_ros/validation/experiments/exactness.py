@@ -138,7 +138,7 @@ def reference_row(problem: SmallProblem) -> Row:
     row: Row = {"what": "reference", "problem": problem.name}
     if len(problem.truth.type) == 1:
         found = enumerate_object(problem)
-        fine, half = [0.0, found.log_evidence[-1]], [0.0, found.log_evidence[-2]]
+        fine, half = [0.0, found.log_evidence[-1]], [0.0, found.log_evidence[-1] - found.moved]
         said = found.marginals(problem)
         cells, neglected = len(found.cells.log_value), 0.0
     else:
