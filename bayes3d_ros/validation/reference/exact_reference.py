@@ -229,10 +229,9 @@ def enumerate_object(
 def at_random_points(cells: Cells, problem: SmallProblem, scene: GivenScene) -> Cells:
     """The same tiling with each cell's value at a point that is uniform in it, so that the sum is right on average
     whatever jumps there are. Middles are not: cells were left whole for having low ones (2 % of the evidence)."""
-    moved = cells.width * (np.random.default_rng(0).random(cells.width.shape) - 0.5)
-    placement = cells.placement
-    x, y, yaw = (np.asarray(a) + moved[:, k] for k, a in enumerate((placement.x, placement.y, placement.yaw)))
-    there = placement._replace(x=x, y=y, yaw=yaw)
+    moved = (cells.width * (np.random.default_rng(0).random(cells.width.shape) - 0.5)).T
+    there = cells.placement
+    there = there._replace(x=there.x + moved[0], y=there.y + moved[1], yaw=there.yaw + moved[2])
     return cells._replace(log_value=_batched(_values, problem, scene, there))
 
 
