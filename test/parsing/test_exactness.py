@@ -142,7 +142,7 @@ def test_pixels_that_count_in_part(seen, step):
     """The posterior of a weighted likelihood is enumerated like any other; it is wider."""
     context = seen.context._replace(image=seen.context.image._replace(weight=np.float32(0.4)))
     grid = for_image(noise_grid(SIGMA_MAX), context.image, SMALL_WINDOW)
-    part = seen._replace(context=context, grid=grid)
+    part = seen._replace(context=context, model=grid)
     log_z, mixed = sampled(part, step())
     log_truth, truth = enumerated(part)
     assert agrees(log_z, log_truth)
@@ -165,6 +165,26 @@ def test_a_hidden_handle(hidden, hidden_exact, step):
     assert (yaw[arc] > true[arc] / 3).all()
 
 
+def test_errors_that_pixels_share():
+    """The model that is shipped, with its amplitudes: evidence and regions of a block."""
+    problem = PROBLEMS["block, shared"]()
+    found = enumerate_object(problem)
+    assert abs(found.log_evidence[-2] - found.log_evidence[-3]) < 0.02  # the last halving
+    assert abs(found.log_evidence[-1] - found.log_evidence[-2]) < 0.02  # random points of cells, not their middles
+    truth = found.marginals(problem)
+    runs = [run(problem, seed, PARTICLES) for seed in range(4)]
+    log_z = np.array([r.log_evidence[-1] for r in runs])
+    assert np.sqrt(np.mean((log_z - found.log_evidence[-1]) ** 2)) < 0.3
+    each = [run_marginals(problem, r) for r in runs]
+    weight = evidence_weights(log_z)
+    mixed = {name: weight @ np.array([getattr(m, name) for m in each]) for name in each[0]._fields}
+    assert total_variation(mixed["face"], truth.face) < 0.1
+    for name in ("x", "y", "yaw"):
+        assert total_variation(binned(name, mixed[name]), binned(name, getattr(truth, name))) < 0.1
+        width, mass = region_against(mixed[name], getattr(truth, name), 0.9)
+        assert 0.8 < width < 1.2 and 0.8 < mass < 0.97
+
+
 def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
     """Its regions are too wide and its marginals far from the exact ones, whatever the evidence."""
     rng, count = np.random.default_rng(0), 4000
@@ -175,7 +195,7 @@ def test_the_prior_as_an_answer_is_caught(seen, seen_exact):
         exact = {
             "log_evidence": [0, seen_exact[0]],
             "num_objects": [0.5, 0.5],
-            "count_ratio": np.exp(-seen_exact[0]),
+            "log_count_ratio": -seen_exact[0],
             "marginals": seen_exact[1]._asdict(),
         }
         row = exact | {"marginals": said._asdict(), "error": 0.0, "ess": 4000.0}
@@ -239,5 +259,5 @@ def test_a_window_counted_wrongly_is_caught(monkeypatch):
 
 def test_number_of_objects_follows_from_evidence():
     """Odds of n + 1 to n are the prior's times Z_{n+1} / Z_n."""
-    p = number_of_objects([0.0, np.log(20.0), np.log(600.0)], 0.1)
+    p = number_of_objects([0.0, np.log(20.0), np.log(600.0)], np.log(0.1))
     np.testing.assert_allclose(p, np.array([1, 2, 6]) / 9)

@@ -90,7 +90,7 @@ def _kinds(axis: Axes, exact: Row, seeds: Sequence[Row], weight: np.ndarray) -> 
         sampled = sampled.reshape(len(seeds), len(values))
         told = weight @ sampled
         if label == "n" and seeds:  # every number's evidence has a mean of its own
-            told = number_of_objects(log_mean([row["log_evidence"] for row in seeds]), exact["count_ratio"])
+            told = number_of_objects(log_mean([row["log_evidence"] for row in seeds]), exact["log_count_ratio"])
         for i, value in enumerate(values):
             if len(values) > 1 and max(value, sampled[:, i].max(initial=0)) > _SHOWN:
                 names.append(f"n = {i}" if label == "n" else f"{label} {i}")

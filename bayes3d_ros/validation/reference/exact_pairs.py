@@ -26,6 +26,7 @@ from bayes3d_ros.validation.reference.exact_reference import (
     enumerate_object,
     heavy,
     marginals,
+    noise_grid_of,
     single,
     take,
     with_object,
@@ -57,8 +58,8 @@ def enumerate_apart(problem: SmallProblem, levels: Levels = LEVELS) -> TwoObject
     scene = bare_scene(problem)
     parts = [enumerate_object(problem, scene, levels, close_to(*place)) for place in true_places(problem)]
     cells = [heaviest(part.cells) for part in parts]
-    to_fine = _to_fine(problem.grid)
-    weight = np.asarray(log_weight(problem.grid), np.float64).ravel()
+    to_fine = _to_fine(noise_grid_of(problem))
+    weight = np.asarray(log_weight(noise_grid_of(problem)), np.float64).ravel()
     base = to_fine @ np.asarray(scene.loglik_grid, np.float64).ravel() + weight
     best = [take(c.placement, [int(np.argmax(c.log_value))]) for c in cells]
     peak = base + to_fine @ sum(all_gains(problem, scene, placement).ravel() for placement in best)
@@ -121,7 +122,7 @@ def _log_terms(
     problem: SmallProblem, scene: GivenScene, cells: Cells, noise: np.ndarray
 ) -> Iterator[Float[np.ndarray, "N F"]]:
     """log of prior, volume and gain of cells at every noise value, in blocks of cells."""
-    to_fine = _to_fine(problem.grid, noise)
+    to_fine = _to_fine(noise_grid_of(problem), noise)
     for i in range(0, len(cells.log_value), BATCH):
         some = take(cells.placement, slice(i, i + BATCH))
         prior = np.asarray(log_prior(single(some), problem.context.library, problem.context.table), np.float64)

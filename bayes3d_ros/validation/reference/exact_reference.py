@@ -21,9 +21,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
+from bayes3d_ros.likelihood.image_model import ImageModel, empty_likelihood, gain, log_marginal
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, log_marginal
-from bayes3d_ros.likelihood.scene_score import log_likelihood_gain, log_likelihood_scene, pad_scene
+from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
+from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
 from bayes3d_ros.objects.library_arrays import NUM_FACES
 from bayes3d_ros.objects.placement import Placement, T_camera_object, log_prior
 from bayes3d_ros.parsing.context import Context
@@ -35,6 +36,8 @@ CELL = 0.015  # metres, at most, of the first cells
 # Level by level: how many nats below the best a cell may be to be halved, and the share of the mass that the lightest
 # cells may hold together to be left whole. Middles of cells wider than a mode understate its flanks.
 LEVELS = ((200.0, 0.0), (60.0, 0.0), (30.0, 1e-6), (30.0, 1e-4), (30.0, 1e-3), (30.0, 1e-3))
+# Where pixels share errors the noise is small, and the likelihood jumps by nats where pixels become edges: once more.
+SHARED_LEVELS = (*LEVELS, (30.0, 0.005))
 Levels = tuple[tuple[float, float], ...]
 # Nats that the last halving, and the one before it, may move the evidence by for it to stand still. Two, because moves
 # change sign: one can be small by chance.
@@ -73,6 +76,14 @@ class Reference(NamedTuple):
 
     cells: Cells
     log_evidence: tuple[float, ...]  # relative to the scene without the object; of every level, the last is the finest
+    at_random: bool = False  # whether the last one is of random points, on the cells of the one before it
+
+    @property
+    def moved(self) -> float:
+        """What the last level changed of the log evidence; where it moved points alone and the last halving changed
+        more, what that did."""
+        moves = np.diff(self.log_evidence)
+        return float(max(moves[-2:] if self.at_random else moves[-1:], key=abs))
 
     def marginals(self, problem: SmallProblem) -> "Marginals":
         weight = np.exp(self.cells.log_mass - self.cells.log_mass.max())
@@ -80,23 +91,31 @@ class Reference(NamedTuple):
 
 
 def bare_scene(problem: SmallProblem) -> GivenScene:
-    return _given_scene(problem, problem.context.image.bare_depth)
+    """The empty table."""
+    image, model = problem.context.image, problem.model
+    padded = pad_scene(image.bare_depth, problem.window)[None]
+    loglik_grid = empty_likelihood(model, padded, image, problem.window)
+    return GivenScene(padded, loglik_grid, log_marginal(model, loglik_grid))
 
 
 def with_object(problem: SmallProblem, placement: Placement) -> GivenScene:
-    """The table with one object, drawn and scored as a whole; placement [1]."""
+    """The table with one object, drawn and scored as a whole; placement [1]. Of pixels that err independently."""
     image, library, table = problem.context
     one = jax.tree.map(lambda a: a[0], single(placement))
     rays = jnp.meshgrid(image.ray_x, image.ray_y)
     depth = _march(library, one.type, T_camera_object(one, library, table), tuple(rays))
-    return _given_scene(problem, jnp.minimum(image.bare_depth, depth))
-
-
-def _given_scene(problem: SmallProblem, depth: Float[Array, "H W"]) -> GivenScene:
-    padded = pad_scene(depth, problem.window)[None]
-    loglik_grid = log_likelihood_scene(padded, problem.context.image, problem.grid.coarse, problem.window)
+    padded = pad_scene(jnp.minimum(image.bare_depth, depth), problem.window)[None]
+    grid = noise_grid_of(problem)
+    loglik_grid = log_likelihood_scene(padded, image, grid.coarse, problem.window)
     loglik_grid = loglik_grid - loglik_grid.max()
-    return GivenScene(padded, loglik_grid, log_marginal(loglik_grid, problem.grid))
+    return GivenScene(padded, loglik_grid, log_marginal(grid, loglik_grid))
+
+
+def noise_grid_of(problem: SmallProblem) -> NoiseGrid:
+    """The grid of noise of a problem whose pixels err independently."""
+    if not isinstance(problem.model, NoiseGrid):
+        raise TypeError(f"{problem.name}: expected pixels that err independently, got errors that they share")
+    return problem.model
 
 
 def yaw_cells(count: int) -> tuple[Float[np.ndarray, "count"], float]:
@@ -142,18 +161,18 @@ def single(placement: Placement) -> Placement:
 
 @partial(jax.jit, static_argnames="window")
 def _gains(
-    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+    placement: Placement, scene: GivenScene, context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N S P"]:
     nobody = jnp.zeros(placement.type.shape, jnp.int32)
-    return log_likelihood_gain(placement, nobody, scene.depth, *context, grid.coarse, window)
+    return gain(model, placement, nobody, scene.depth, context, window)[0]
 
 
 @partial(jax.jit, static_argnames="window")
 def _values(
-    placement: Placement, scene: GivenScene, context: Context, grid: NoiseGrid, window: int
+    placement: Placement, scene: GivenScene, context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N"]:
-    gain = _gains(placement, scene, context, grid, window)
-    value = log_marginal(scene.loglik_grid + gain, grid) - scene.log_likelihood
+    gained = _gains(placement, scene, context, model, window)
+    value = log_marginal(model, scene.loglik_grid + gained) - scene.log_likelihood
     return value + log_prior(placement, context.library, context.table)
 
 
@@ -163,7 +182,7 @@ def _batched(function, problem: SmallProblem, scene: GivenScene, placement: Plac
 
     def batch(start: int) -> np.ndarray:
         some = take(placement, np.arange(start, start + BATCH) % count)
-        values = function(single(some), scene, problem.context, problem.grid, problem.window)
+        values = function(single(some), scene, problem.context, problem.model, problem.window)
         return np.asarray(values, np.float64)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -171,20 +190,24 @@ def _batched(function, problem: SmallProblem, scene: GivenScene, placement: Plac
 
 
 def all_gains(problem: SmallProblem, scene: GivenScene, placement: Placement) -> Float[np.ndarray, "N S P"]:
-    """Log likelihood that objects add to a scene, at every noise level of the coarse grid."""
+    """Log likelihood that objects add to a scene, at every node of the noise, or of the errors."""
     return _batched(_gains, problem, scene, placement)
 
 
 def enumerate_object(
     problem: SmallProblem,
     scene: GivenScene | None = None,
-    levels: Levels = LEVELS,
+    levels: Levels | None = None,
     where: Where | None = None,
     cell: float = CELL,
 ) -> Reference:
     """The posterior of one object added to a scene (by default the empty table). The best cells are halved len(levels)
-    times, fewer once the evidence stands still. `where` leaves out cells of the first level."""
+    times, fewer once the evidence stands still; by default as the model needs. Of errors that pixels share the last
+    evidence, and the values, are those at random points of the cells. `where` leaves out cells of the first level."""
     scene = bare_scene(problem) if scene is None else scene
+    shared = not isinstance(problem.model, NoiseGrid)
+    if levels is None:
+        levels = SHARED_LEVELS if shared else LEVELS
     placement, width = all_cells(problem, cell)
     if where is not None:
         inside = where(placement)
@@ -197,7 +220,19 @@ def enumerate_object(
         moves = np.abs(np.diff(log_evidence[-3:]))
         if len(log_evidence) > 3 and moves[1] < _STILL and moves[0] < _NEARLY:
             break
-    return Reference(cells, tuple(log_evidence))
+    if shared:
+        cells = at_random_points(cells, problem, scene)
+        log_evidence.append(float(logsumexp(cells.log_mass)))
+    return Reference(cells, tuple(log_evidence), shared)
+
+
+def at_random_points(cells: Cells, problem: SmallProblem, scene: GivenScene) -> Cells:
+    """The same tiling with each cell's value at a point that is uniform in it, so that the sum is right on average
+    whatever jumps there are. Middles are not: cells were left whole for having low ones (2 % of the evidence)."""
+    moved = (cells.width * (np.random.default_rng(0).random(cells.width.shape) - 0.5)).T
+    there = cells.placement
+    there = there._replace(x=there.x + moved[0], y=there.y + moved[1], yaw=there.yaw + moved[2])
+    return cells._replace(log_value=_batched(_values, problem, scene, there))
 
 
 def halve(cells: Cells, which: np.ndarray, problem: SmallProblem, scene: GivenScene) -> Cells:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scenes small enough to be enumerated: a low-resolution noisy image of one or two simple solids on a small table."""
+"""Scenes small enough to be enumerated: a low-resolution noisy image of one or two simple solids on a small table,
+under either model of an image (`likelihood/image_model.py`)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,14 +14,19 @@ from jaxtyping import Float
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.image_model import ImageModel, shared_errors
 from bayes3d_ros.likelihood.march import march
-from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, for_image, noise_grid
+from bayes3d_ros.likelihood.noise_marginal import for_image, noise_grid
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.objects.library_arrays import library_arrays
+from bayes3d_ros.likelihood.shared_errors import shared_error_image
+from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.observe import amplitudes_of
+from bayes3d_ros.parsing.tuning import SEARCH
+from bayes3d_ros.settings import ParserSettings
 
 SMALL_CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 NEAREST_RETURN, FARTHEST_RETURN = 0.1, 2.0  # metres
@@ -31,6 +37,9 @@ SIGMA_MAX = 0.03
 TRUE_P_OUTLIER = 0.2
 SMALL_WINDOW, MAX_OBJECTS = 3, 2
 SMALL_VOXEL = 0.005
+# Where errors are shared: what the settings say of them, without anything unknown, and noise for it.
+SHARED = ParserSettings(unknown=False)
+SHARED_SIGMA, SHARED_P_OUTLIER = 0.003, 0.02
 
 _march = jax.jit(march)
 
@@ -41,7 +50,7 @@ class SmallProblem(NamedTuple):
     name: str
     library: Library
     context: Context
-    grid: NoiseGrid
+    model: ImageModel
     truth: Placement  # [k]
     table_size: tuple[float, float] = TABLE_SIZE
     window: int = SMALL_WINDOW
@@ -83,14 +92,19 @@ def small_T_camera_table() -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def make(
-    name: str,
-    meshes: dict[str, trimesh.Trimesh],
-    rows: list[tuple[int, float, float, float]],
-    sigma: float,
-) -> SmallProblem:
-    """An image of upright objects, rows (type, x, y, yaw): `yaw` turns their mesh. Noise is normal along the rays, its
-    outliers are uniform in the frustum's volume."""
+class Drawn(NamedTuple):
+    """What is seen of a scene without errors."""
+
+    library: Library
+    arrays: LibraryArrays
+    table: Table
+    truth: Placement  # [k]
+    depth: Float[np.ndarray, "H W"]  # metres
+    bare: Float[np.ndarray, "H W"]  # the same of the table alone
+
+
+def draw(meshes: dict[str, trimesh.Trimesh], rows: list[tuple[int, float, float, float]]) -> Drawn:
+    """Upright objects, rows (type, x, y, yaw): `yaw` turns their mesh."""
     library = Library(tuple(model_from_mesh(mesh, key, SMALL_VOXEL) for key, mesh in meshes.items()))
     arrays = library_arrays(library)
     table = Table(jnp.asarray(small_T_camera_table(), jnp.float32), jnp.array(TABLE_SIZE))
@@ -102,23 +116,57 @@ def make(
         one = jax.tree.map(lambda a, k=k: a[k], truth)
         pose = T_camera_object(one, arrays, table)
         depth = np.minimum(depth, np.asarray(_march(arrays, one.type, pose, (rays[..., 0], rays[..., 1]))))
+    return Drawn(library, arrays, table, truth, depth, bare)
+
+
+def observe(
+    drawn: Drawn, depth: Float[np.ndarray, "H W"], sigma: float, p_outlier: float, sigma_max: float
+) -> ScoredImage:
+    """Noise that is normal along the rays, and outliers that are uniform in the frustum's volume; metres."""
+    rays = SMALL_CAMERA.rays()
     rng = np.random.default_rng(0)
     noisy = depth + sigma / np.linalg.norm(rays, axis=-1) * rng.normal(size=depth.shape)
     wild = np.cbrt(NEAREST_RETURN**3 + rng.random(depth.shape) * (FARTHEST_RETURN**3 - NEAREST_RETURN**3))
-    observed = np.where(rng.random(depth.shape) < TRUE_P_OUTLIER, wild, noisy)
-    image = ScoredImage(
+    observed = np.where(rng.random(depth.shape) < p_outlier, wild, noisy)
+    return ScoredImage(
         depth=jnp.asarray(observed, jnp.float32),
         pixel_class=jnp.full(depth.shape, IN_WORKSPACE, jnp.int32),
         ray_x=jnp.asarray(rays[0, :, 0], jnp.float32),
         ray_y=jnp.asarray(rays[:, 0, 1], jnp.float32),
         focal=jnp.array([SMALL_CAMERA.fx, SMALL_CAMERA.fy], jnp.float32),
         centre=jnp.array([SMALL_CAMERA.cx, SMALL_CAMERA.cy], jnp.float32),
-        bare_depth=jnp.asarray(bare, jnp.float32),
+        bare_depth=jnp.asarray(drawn.bare, jnp.float32),
         outlier_scale=jnp.float32(3 / (FARTHEST_RETURN**3 - NEAREST_RETURN**3)),
-        front_margin=jnp.float32(3 * SIGMA_MAX),
+        front_margin=jnp.float32(3 * sigma_max),
     )
-    context = Context(image, arrays, table)
-    return SmallProblem(name, library, context, for_image(noise_grid(SIGMA_MAX), context.image, SMALL_WINDOW), truth)
+
+
+def make(
+    name: str, meshes: dict[str, trimesh.Trimesh], rows: list[tuple[int, float, float, float]], sigma: float
+) -> SmallProblem:
+    """Pixels that err independently; sigma: metres."""
+    drawn = draw(meshes, rows)
+    image = observe(drawn, drawn.depth, sigma, TRUE_P_OUTLIER, SIGMA_MAX)
+    model = for_image(noise_grid(SIGMA_MAX), image, SMALL_WINDOW)
+    return SmallProblem(name, drawn.library, Context(image, drawn.arrays, drawn.table), model, drawn.truth)
+
+
+def make_shared(
+    name: str, meshes: dict[str, trimesh.Trimesh], rows: list[tuple[int, float, float, float]]
+) -> SmallProblem:
+    """Errors that pixels share, with the amplitudes of `ParserSettings`: a bias of all objects, and one of each square
+    of 2 x 2 pixels."""
+    drawn = draw(meshes, rows)
+    rng = np.random.default_rng(1)
+    squares = np.kron(rng.normal(size=[n // 2 for n in drawn.depth.shape]), np.ones((2, 2)))
+    of_object = SHARED.surface_bias * rng.normal() + np.hypot(SHARED.surface_waves, SHARED.model_error) * squares
+    error = np.where(drawn.depth < drawn.bare, of_object, SHARED.surface_waves * squares)
+    image = observe(drawn, drawn.depth + error, SHARED_SIGMA, SHARED_P_OUTLIER, SHARED.sigma_max)
+    image = image._replace(weight=jnp.float32(SEARCH.pixel_weight))  # of the search alone
+    numbers: ScoredImage = jax.tree.map(np.asarray, image)
+    errors = shared_error_image(numbers, amplitudes_of(SHARED), SHARED.sigma_max)
+    model = jax.device_put(shared_errors(numbers, errors))
+    return SmallProblem(name, drawn.library, Context(image, drawn.arrays, drawn.table), model, drawn.truth)
 
 
 def upright(library: Library, T_contact_object: Float[jax.Array, "K 6 4 4"], rows: list) -> Placement:
@@ -156,5 +204,17 @@ PROBLEMS: dict[str, Callable[[], SmallProblem]] = {
     ),
     "two blocks": lambda: make(
         "two blocks", {"block": step_block()}, [(0, -0.055, -0.03, 0.4), (0, 0.055, 0.03, -0.9)], 0.012
+    ),
+    "block, shared": lambda: make_shared("block, shared", {"block": step_block()}, [(0, 0.01, -0.02, 0.4)]),
+    "handle hidden, shared": lambda: make_shared(
+        "handle hidden, shared", {"mug": cup(True)}, [(0, 0.01, -0.01, np.pi / 2)]
+    ),
+    "mug or cup, shared": lambda: make_shared(
+        "mug or cup, shared", {"cup": cup(False), "mug": cup(True)}, [(1, 0.01, -0.01, np.pi / 2)]
+    ),
+    "two bricks, shared": lambda: make_shared(
+        "two bricks, shared",
+        {"long": brick(0.07, 0.05, 0.035), "short": brick(0.062, 0.05, 0.035)},
+        [(0, -0.01, 0.01, 0.5)],
     ),
 }

@@ -64,7 +64,7 @@ def log_mean(log_estimates: Sequence[Sequence[float]] | np.ndarray) -> Float[np.
     return np.logaddexp.reduce(np.asarray(log_estimates, float), 0) - np.log(len(log_estimates))
 
 
-def number_of_objects(log_evidence: Sequence[float] | np.ndarray, count_ratio: float) -> Float[np.ndarray, "n"]:
+def number_of_objects(log_evidence: Sequence[float] | np.ndarray, log_count_ratio: float) -> Float[np.ndarray, "n"]:
     """p(n | image) for a prior that stops at the most objects that log_evidence knows of."""
-    log_p = np.asarray(log_evidence) + np.arange(len(log_evidence)) * np.log(count_ratio)
+    log_p = np.asarray(log_evidence) + np.arange(len(log_evidence)) * log_count_ratio
     return np.exp(log_p - np.logaddexp.reduce(log_p))
