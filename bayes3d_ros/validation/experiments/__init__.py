@@ -16,6 +16,7 @@ EXPERIMENTS: dict[str, str] = {
     "additivity": "bayes3d_ros.validation.experiments.additivity",
     "calibration": "bayes3d_ros.validation.experiments.calibration",
     "calibration-points": "bayes3d_ros.validation.experiments.calibration_points",
+    "calibration-shared": "bayes3d_ros.validation.experiments.calibration_shared",
     "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",
     "coverage": "bayes3d_ros.validation.experiments.coverage",
     "dial": "bayes3d_ros.validation.experiments.dial",
