@@ -62,6 +62,7 @@ SHARED_SETTINGS = ParserSettings(
     unknown=False,
     outline_sigma=0.0,  # added after the weights, no part of the model
     particles=192,
+    rejuvenated_objects=3,  # all of them: ranks are of copies that count once
 )
 
 
