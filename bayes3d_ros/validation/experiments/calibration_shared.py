@@ -85,7 +85,9 @@ def shared_scene_row(k: int, problem: SharedProblem, **wrong: Any) -> Row:
     margin = np.asarray(model.image.table_margin, np.float64)
     row["log_mass"] = round(float(log_masses(one, np.array([number]), margin, problem)[0]), 3)
     row["errors"] = {"table": round(errors.table, 6), "scale": round(errors.scale, 4)}
-    row["nodes"] = {name: sorted({float(f"{v:.4g}") for v in np.asarray(getattr(model.image.nodes, name))}) for name in NOISE}
+    row["nodes"] = {
+        name: sorted({float(f"{v:.4g}") for v in np.asarray(getattr(model.image.nodes, name))}) for name in NOISE
+    }
     row["given_scene"] = _noise_ranks(image, jax.device_get(model.image), scene, errors) if number == 0 else None
     return row | {"seconds": round(seconds, 3)}
 

@@ -228,7 +228,9 @@ def _edge_inliers(
         y, there = shifted(scene.depth, dv, du, np.inf)[v, u], shifted(scene.label, dv, du, NOTHING)[v, u]
         ex, ey = du / float(frame.rays.focal[0]), dv / float(frame.rays.focal[1])
         sd = np.sqrt(frame.noise[v, u] ** 2 + np.where(there == TABLE, frame.errors.table**2, of_object))
-        window.append((np.where(np.isfinite(y), du**2 + dv**2, np.inf), y, y * (1 + (ex * a + ey * b) / norm2), sd, there))
+        window.append(
+            (np.where(np.isfinite(y), du**2 + dv**2, np.inf), y, y * (1 + (ex * a + ey * b) / norm2), sd, there)
+        )
     apart, points, mean, sd, label = (np.array(part) for part in zip(*window, strict=True))
     weight = np.exp(-0.5 * (apart - apart.min(0)) / float(amplitudes.edge_blur) ** 2)
     chosen = (rng.random(len(v)) * weight.sum(0) >= np.cumsum(weight, 0)).sum(0).clip(max=8)
@@ -297,10 +299,26 @@ class _ObjectCells:
             elif kind > 0.5 * self.bad_share or not self._standing(at):
                 off = -BAD_DEPTH * self.rng.random()
             else:
-                off = self._own_plane(c) - depth
-            inliers = depth + off + self.frame.noise[at] * self.rng.standard_normal(len(depth))
-            observed[at] = _with_outliers(self.rng, inliers, self.frame, at)
-            self._tell(c, observed[at], mean, variance, np.ndim(off) > 0)
+                observed[at] = self._dent(c)
+                self._tell(c, observed[at], mean, variance, True)
+                continue
+            observed[at] = self._returns(at, depth + off)
+            self._tell(c, observed[at], mean, variance, False)
+
+    def _returns(self, at, depth: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+        """Of a surface at these depths, metres."""
+        noise = self.frame.noise[at] * self.rng.standard_normal(len(depth))
+        return _with_outliers(self.rng, depth + noise, self.frame, at)
+
+    def _dent(self, c: int) -> Float[np.ndarray, "K"]:
+        """Returns of a cell that is a plane of its own, metres: their median is not too far off."""
+        at = self.pixels[c]
+        for _ in range(_PLANE_TRIALS):
+            returns = self._returns(at, self._own_plane(c))
+            seen = returns > self.frame.front[at]
+            if seen.any() and -BAD_DEPTH < np.median((returns - self.scene.depth[at])[seen]) < SEEN_THROUGH:
+                return returns
+        return self._returns(at, self.scene.depth[at] - BAD_DEPTH * self.rng.random())
 
     def _standing(self, at) -> bool:
         """Whether the cell stands in front of the table: others have no planes of their own."""
@@ -371,19 +389,14 @@ class _ObjectCells:
         return np.linalg.solve(information, (phi.T * weight) @ returns + prior[0] * np.median(returns)), information
 
     def _own_plane(self, c: int) -> Float[np.ndarray, "K"]:
-        """Depths of a cell that is a plane of its own, metres: `own_plane.py`'s, whose median is not too far off."""
+        """Depths of a cell that is a plane of its own, metres, as `own_plane.py` has it."""
         depth, phi = self.scene.depth[self.pixels[c]], self._around_middle(c, c)
         others = [k for k in (self.beside.left[c], self.beside.above[c]) if k in self.planes]
         anew = _NEW_PLANES * (_ANEW if others else 1.0)
-        for _ in range(_PLANE_TRIALS):
-            if not others or self.rng.random() < anew / (anew + 1 - _ANEW):
-                plane = np.append(0.0, _SLOPE_SD * self.rng.standard_normal(2))
-                own = phi @ plane
-                return own - np.median(own - depth) + self.rng.uniform(-BAD_DEPTH, SEEN_THROUGH)
-            own = phi @ self._gone_on(c, int(self.rng.choice(others)))
-            if -BAD_DEPTH < np.median(own - depth) < SEEN_THROUGH:
-                return own
-        return depth + self.rng.uniform(-BAD_DEPTH, 0.0)
+        if others and self.rng.random() * (anew + 1 - _ANEW) >= anew:
+            return phi @ self._gone_on(c, int(self.rng.choice(others)))
+        own = phi @ np.append(0.0, _SLOPE_SD * self.rng.standard_normal(2))
+        return own - np.median(own - depth) + self.rng.uniform(-BAD_DEPTH, SEEN_THROUGH)
 
     def _gone_on(self, c: int, other: int) -> Float[np.ndarray, "3"]:
         """The plane of a neighbour, turned and displaced, about the middle of the cell c."""

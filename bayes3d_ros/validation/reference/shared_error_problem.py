@@ -16,7 +16,14 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
-from bayes3d_ros.likelihood.image_model import SharedErrors, gain, log_marginal, sample_noise, shared_errors, with_object
+from bayes3d_ros.likelihood.image_model import (
+    SharedErrors,
+    gain,
+    log_marginal,
+    sample_noise,
+    shared_errors,
+    with_object,
+)
 from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scene_score import pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
@@ -51,7 +58,10 @@ from bayes3d_ros.validation.reference.shared_error_predictive import (
 )
 
 SHARED_CAMERA = Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120)  # of a D435
-SHARED_DISTANCE, SHARED_ELEVATION = 0.85, np.radians(60)  # metres from the table's middle; of the view below the horizon
+SHARED_DISTANCE, SHARED_ELEVATION = (
+    0.85,
+    np.radians(60),
+)  # metres from the table's middle; of the view below the horizon
 SHARED_SETTINGS = ParserSettings(
     max_objects=3,
     count_ratio=1.0,
@@ -242,9 +252,7 @@ def run_shared_sampler(
         log_mass.append(log_masses(stages[-1].objects, stages[-1].number, margin, problem))
     mixture: Samples = jax.tree.map(lambda *parts: np.concatenate(parts), *stages)
     weight = np.exp(mixture.weight.astype(float) - mixture.weight.max())
-    return SharedPosterior(
-        mixture._replace(weight=weight / weight.sum(), ess=tuple(ess)), np.concatenate(log_mass)
-    )
+    return SharedPosterior(mixture._replace(weight=weight / weight.sum(), ess=tuple(ess)), np.concatenate(log_mass))
 
 
 def _kept(key: PRNGKeyArray, state: smc.Population, number: int, model: SharedErrors, log_weight: float) -> Samples:
