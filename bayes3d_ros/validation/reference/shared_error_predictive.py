@@ -9,16 +9,15 @@ An object's cells are drawn one after the other, each given the returns of the o
 approximation has them: so waves are of the very density that scores them (`whole_waves` draws the Gaussian process).
 
 What of the density is not normalised, over images of one scene (measured on the scenes of `calibration-shared`):
-- a return near an outline that lies anywhere adds `LOST_SHARE` edge_share / `LOST_DEPTH` = 0.17 a metre to a density that
-  integrates to one without it, from the margin in front of the scene to `far`. `lost_mass` is the integral, 0.03 to 0.1
-  a pixel within two of an outline: 10 to 30 nats an object. Images are drawn from the density divided by its
-  integral, so a sampler of the density itself is given that of a scene as a factor too many;
+- a return near an outline that lies anywhere adds `LOST_SHARE` edge_share / `LOST_DEPTH` = 0.17 a metre to a density
+  that integrates to one without it, from the margin in front of the scene to `far`. `lost_mass` is that integral, 0.03
+  to 0.1 a pixel within two of an outline: 20 to 60 nats an object, 0.05 to 0.2 nats of which change from sample to
+  sample of a posterior. Images are drawn from the density divided by its integral, so a sampler of the density itself
+  is given a factor too many;
 - a return that stands in front of a scene by more than a margin is an outlier, and no part of a cell or an edge: what
-  cells and edges say there is cut off. Margins are five standard deviations at least: less than 1e-6 a pixel;
+  these say there is cut off. Margins are five standard deviations at least: less than 1e-6 a pixel;
 - planes of their own are about the median of their own returns (normal, 3 cm), and cut off where that is not within the
-  3 cm that a bad cell may be off: 0.4 of their mass is left where they begin anew, nearly all where they go on from
-  a neighbour (`_NEW_PLANES`). A bad cell has 0.93 of a density, so a cell is 0.3 % too cheap at a `bad_share` of .04: about
-  half a nat an object;
+  3 cm that a bad cell may be off: 0.4 of their mass is left where they begin anew (`_NEW_PLANES`);
 - noise is as wide as the *observed* depth makes it: 2 sigma / z, less than 1 % of a standard deviation.
 What is drawn only nearly: planes of their own go on from the plane of the neighbour's inliers, which the density finds
 by reweighting; and whether a neighbour is good is told without them.
@@ -45,7 +44,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     TABLE_MARGIN_SDS,
     Amplitudes,
 )
-from bayes3d_ros.likelihood.slow_cells import SurfaceCells, modes
+from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells, modes
 from bayes3d_ros.likelihood.slow_object_cells import Neighbours
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, around, shifted
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
@@ -54,7 +53,7 @@ from bayes3d_ros.validation.reference.prior_predictive import DepthRange
 _STEP_SD, _BEND_SD, _SLOPE_SD, _DEPTH_SD = 0.002, 0.8, 1.0, 0.03
 _ANEW = 0.2
 _NEW_PLANES = (BAD_DEPTH + SEEN_THROUGH) / (np.sqrt(2 * np.pi) * _DEPTH_SD)  # what is left of their mass
-_PLANE_TRIALS = 20
+_CELL_TRIALS = 20
 _HIGHEST_NODE = 1.083  # the largest of an image's nodes of sigma, which makes the margin, in units of sigma
 
 
@@ -116,7 +115,7 @@ def sample_errors(
 
 
 def spread_of(depth: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Standard deviation of returns at these depths in units of that at their median, as `shared_error_image` has it."""
+    """Standard deviation of returns at these depths over that at their median, as `shared_error_image` has it."""
     reference = np.median(depth[np.isfinite(depth)])
     return np.sqrt(0.5 + 0.5 * (np.where(np.isfinite(depth), depth, reference) / reference) ** 4)
 
@@ -292,18 +291,27 @@ class _ObjectCells:
         """The cells' returns into the image, metres."""
         for c, at in enumerate(self.pixels):
             mean, variance = self._given_others(c)
-            kind = self.rng.random()
-            depth = self.scene.depth[at]
+            kind, plane = self.rng.random(), False
             if kind > self.bad_share:
                 off = mean + np.sqrt(variance) * self.rng.standard_normal()
+                observed[at] = self._returns(at, self.scene.depth[at] + off)
             elif kind > 0.5 * self.bad_share or not self._standing(at):
-                off = -BAD_DEPTH * self.rng.random()
+                observed[at] = self._displaced(c)
             else:
-                observed[at] = self._dent(c)
-                self._tell(c, observed[at], mean, variance, True)
-                continue
-            observed[at] = self._returns(at, depth + off)
-            self._tell(c, observed[at], mean, variance, False)
+                observed[at], plane = self._dent(c), True
+            self._tell(c, observed[at], mean, variance, plane)
+
+    def _displaced(self, c: int) -> Float[np.ndarray, "K"]:
+        """Returns of a cell that is off as a whole, metres: their mode is uniform in the `BAD_DEPTH` towards the
+        camera, which cuts the density off."""
+        at = self.pixels[c]
+        wide = 3 * float(self.frame.noise[at].mean())
+        for _ in range(_CELL_TRIALS):
+            returns = self._returns(at, self.scene.depth[at] + self.rng.uniform(-BAD_DEPTH - wide, wide))
+            found = self._modes(c, returns)
+            if found is not None and -BAD_DEPTH < found.place[int(np.argmax(found.height[:, 0])), 0] < 0:
+                break
+        return returns
 
     def _returns(self, at, depth: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
         """Of a surface at these depths, metres."""
@@ -313,7 +321,7 @@ class _ObjectCells:
     def _dent(self, c: int) -> Float[np.ndarray, "K"]:
         """Returns of a cell that is a plane of its own, metres: their median is not too far off."""
         at = self.pixels[c]
-        for _ in range(_PLANE_TRIALS):
+        for _ in range(_CELL_TRIALS):
             returns = self._returns(at, self._own_plane(c))
             seen = returns > self.frame.front[at]
             if seen.any() and -BAD_DEPTH < np.median((returns - self.scene.depth[at])[seen]) < SEEN_THROUGH:
@@ -343,11 +351,27 @@ class _ObjectCells:
 
     def _tell(self, c: int, returns: Float[np.ndarray, "K"], mean: float, variance: float, plane: bool) -> None:
         """What the cell's returns tell of the waves there, and of a plane."""
+        found = self._modes(c, returns)
+        if found is None:
+            return
+        share = float(self.frame.amplitudes.bad_share)
+        spread = 1 + found.curvature[:, 0] * variance
+        apart = (found.place[:, 0] - mean) ** 2 * found.curvature[:, 0] / spread
+        good = np.log1p(-share) + found.height[:, 0] - 0.5 * np.log(spread) - 0.5 * apart
+        bad = [np.log1p(-share) + found.outliers[0], np.log(share + 1e-300) + found.bad(np.full(1, -np.inf))[0]]
+        good = np.exp(good - np.logaddexp.reduce([*good, *bad])) * (not plane)
+        tells = good * found.curvature[:, 0] / (1 + found.curvature[:, 0] * self.model)
+        self.told[c] = tells.sum()
+        self.told_place[c] = tells @ found.place[:, 0] / (self.told[c] + 1e-6)
+        self.planes[c] = self._fitted(c, returns, found.place[int(np.argmax(found.height[:, 0])), 0])
+
+    def _modes(self, c: int, returns: Float[np.ndarray, "K"]) -> CellModes | None:
+        """The cell's likelihood as a function of its offset; None where all its returns stand in front."""
         at = self.pixels[c]
         errors, limits = self.frame.errors, self.frame.limits
         seen = returns > self.frame.front[at]
         if not seen.any():
-            return
+            return None
         residual = (returns - self.scene.depth[at])[seen][None]
         shape = residual.shape
         noise = self.frame.noise[at][seen][None]
@@ -362,17 +386,7 @@ class _ObjectCells:
             np.zeros((1, 2)),
             np.full((1, 1), -np.inf),
         )
-        found = modes(cells, errors.sigma, errors.p_outlier)
-        share = float(self.frame.amplitudes.bad_share)
-        spread = 1 + found.curvature[:, 0] * variance
-        apart = (found.place[:, 0] - mean) ** 2 * found.curvature[:, 0] / spread
-        good = np.log1p(-share) + found.height[:, 0] - 0.5 * np.log(spread) - 0.5 * apart
-        bad = [np.log1p(-share) + found.outliers[0], np.log(share + 1e-300) + found.bad(np.full(1, -np.inf))[0]]
-        good = np.exp(good - np.logaddexp.reduce([*good, *bad])) * (not plane)
-        tells = good * found.curvature[:, 0] / (1 + found.curvature[:, 0] * self.model)
-        self.told[c] = tells.sum()
-        self.told_place[c] = tells @ found.place[:, 0] / (self.told[c] + 1e-6)
-        self.planes[c] = self._fitted(c, returns, found.place[int(np.argmax(found.height[:, 0])), 0])
+        return modes(cells, errors.sigma, errors.p_outlier)
 
     def _around_middle(self, c: int, of: int) -> Float[np.ndarray, "K 3"]:
         """1, x and y of the pixels of cell `of`, metres from the middle of cell c."""

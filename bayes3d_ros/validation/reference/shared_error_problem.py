@@ -243,8 +243,8 @@ def run_shared_sampler(
             ess.append(float(info.ess))
         log_weights.append(float(state.log_evidence) + problem.log_count[number])
         if number > 1 and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
-            given = (context, model, settings.window, settings.ess_threshold, effort)
-            state = smc.refresh(jax.random.fold_in(key, 2000 + number), state, jnp.int32(number), *given)
+            again = (context, model, settings.window, settings.ess_threshold, effort)
+            state = smc.refresh(jax.random.fold_in(key, 2000 + number), state, jnp.int32(number), *again)
         stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weights[-1]))
         if log_weights[-1] < max(log_weights) - NEGLIGIBLE:
             log_mass.append(np.full(settings.particles, np.inf))  # no weight is left of them
@@ -258,16 +258,9 @@ def run_shared_sampler(
 def _kept(key: PRNGKeyArray, state: smc.Population, number: int, model: SharedErrors, log_weight: float) -> Samples:
     """A stage's scenes, with log weights that sum to the stage's."""
     noise = _sample_noise(key, model, state.loglik_grid)
-    stage = Samples(
-        number=np.full(len(state.log_weight), number),
-        objects=state.objects,
-        sigma=noise.sigma,
-        p_outlier=noise.p_outlier,
-        log_likelihood=state.log_likelihood,
-        weight=state.log_weight + log_weight,
-        ess=(),
-    )
-    return jax.device_get(stage)
+    kept = state.objects, noise.sigma, noise.p_outlier, state.log_likelihood, state.log_weight
+    objects, sigma, p_outlier, log_likelihood, weight = jax.device_get(kept)
+    return Samples(np.full(len(weight), number), objects, sigma, p_outlier, log_likelihood, weight + log_weight, ess=())
 
 
 class NoisePosterior(NamedTuple):
