@@ -4,8 +4,8 @@
 objects, images from the model's own density (`validation/reference/shared_error_predictive.py`).
 
 Ranks are told thrice: of the posterior as it is; of the one whose density is divided by its integral over images, which
-the images are drawn from (`normalised`); and of sigma and p_outlier given an empty table, on a fine grid in place of the
-nodes that are chosen from the image (`given_scene`).
+the images are drawn from (`normalised`); and of sigma and p_outlier given an empty table, on a fine grid in place of
+the nodes that are chosen from the image (`given_scene`).
 """
 
 import time
@@ -32,6 +32,7 @@ from bayes3d_ros.validation.reference.shared_error_problem import (
     run_shared_sampler,
     shared_problem,
     simulate_shared_image,
+    ten_types,
 )
 from bayes3d_ros.validation.statistics.ranks import uniformity
 
@@ -56,7 +57,7 @@ def count(quick: bool) -> int:
 
 def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
-    problem = shared_problem()
+    problem = shared_problem(ten_types())
     for k in range(count(quick)):
         yield row_step(shared_scene_row, k, problem)
 

@@ -37,6 +37,7 @@ from bayes3d_ros.likelihood.shared_errors import (
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT, TABLE
 from bayes3d_ros.likelihood.slow_shared_errors import log_density
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.objects.placement import Table as PriorTable
 from bayes3d_ros.objects.store import load_library
@@ -104,10 +105,14 @@ class SharedPosterior(NamedTuple):
         return self.samples._replace(weight=weight / weight.sum())
 
 
-def shared_problem(settings: ParserSettings = SHARED_SETTINGS) -> SharedProblem:
-    """The library on a table seen from above at 60 degrees. Raises MeshError where YCB meshes are not installed."""
+def ten_types() -> Library:
+    """The library of ten YCB types. Raises MeshError where the meshes are not installed."""
     with tempfile.TemporaryDirectory(prefix="bayes3d-calibration-") as folder:
-        library = load_library(ycb_library(TEN_TYPES, Path(folder)))
+        return load_library(ycb_library(TEN_TYPES, Path(folder)))
+
+
+def shared_problem(library: Library, settings: ParserSettings = SHARED_SETTINGS) -> SharedProblem:
+    """The library on a table seen from above at 60 degrees."""
     c, s = np.cos(SHARED_ELEVATION), np.sin(SHARED_ELEVATION)
     T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, SHARED_DISTANCE], [0, 0, 0, 1]])
     rays = SHARED_CAMERA.rays().astype(np.float64)
