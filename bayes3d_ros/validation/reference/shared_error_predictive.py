@@ -11,13 +11,16 @@ approximation has them: so waves are of the very density that scores them (`whol
 What of the density is not normalised, over images of one scene (measured on the scenes of `calibration-shared`):
 - a return near an outline that lies anywhere adds `LOST_SHARE` edge_share / `LOST_DEPTH` = 0.17 a metre to a density
   that integrates to one without it, from the margin in front of the scene to `far`. `lost_mass` is that integral, 0.03
-  to 0.1 a pixel within two of an outline: 20 to 60 nats an object, 0.05 to 0.2 nats of which change from sample to
+  to 0.1 a pixel within two of an outline: 20 to 55 nats an object, 0.05 to 0.2 nats of which change from sample to
   sample of a posterior. Images are drawn from the density divided by its integral, so a sampler of the density itself
   is given a factor too many;
 - a return that stands in front of a scene by more than a margin is an outlier, and no part of a cell or an edge: what
   these say there is cut off. Margins are five standard deviations at least: less than 1e-6 a pixel;
 - planes of their own are about the median of their own returns (normal, 3 cm), and cut off where that is not within the
-  3 cm that a bad cell may be off: 0.4 of their mass is left where they begin anew (`_NEW_PLANES`);
+  3 cm that a bad cell may be off: 0.4 of their mass is left where they begin anew (`_NEW_PLANES`), 0.8 where they go on
+  from a neighbour (measured). So a cell has 0.6 % too little mass at a `bad_share` of .04: a nat an object. At
+  these cuts the density jumps, by what it costs that all returns of a cell are outliers: by 70 nats from one pose to
+  another 0.1 mm away, where a cell is 2 cm in front (sigma 1.2 mm, 5 % outliers);
 - noise is as wide as the *observed* depth makes it: 2 sigma / z, less than 1 % of a standard deviation.
 What is drawn only nearly: planes of their own go on from the plane of the neighbour's inliers, which the density finds
 by reweighting; and whether a neighbour is good is told without them.
@@ -291,15 +294,19 @@ class _ObjectCells:
         """The cells' returns into the image, metres."""
         for c, at in enumerate(self.pixels):
             mean, variance = self._given_others(c)
-            kind, plane = self.rng.random(), False
-            if kind > self.bad_share:
-                off = mean + np.sqrt(variance) * self.rng.standard_normal()
-                observed[at] = self._returns(at, self.scene.depth[at] + off)
-            elif kind > 0.5 * self.bad_share or not self._standing(at):
-                observed[at] = self._displaced(c)
-            else:
-                observed[at], plane = self._dent(c), True
-            self._tell(c, observed[at], mean, variance, plane)
+            returns = None
+            while returns is None:  # what is cut off of a kind makes it rarer
+                kind = self.rng.random()
+                plane = kind < 0.5 * self.bad_share
+                if plane:
+                    returns = self._dent(c)
+                elif kind < self.bad_share:
+                    returns = self._displaced(c)
+                else:
+                    off = mean + np.sqrt(variance) * self.rng.standard_normal()
+                    returns = self._returns(at, self.scene.depth[at] + off)
+            observed[at] = returns
+            self._tell(c, returns, mean, variance, plane)
 
     def _displaced(self, c: int) -> Float[np.ndarray, "K"]:
         """Returns of a cell that is off as a whole, metres: their mode is uniform in the `BAD_DEPTH` towards the
@@ -318,15 +325,16 @@ class _ObjectCells:
         noise = self.frame.noise[at] * self.rng.standard_normal(len(depth))
         return _with_outliers(self.rng, depth + noise, self.frame, at)
 
-    def _dent(self, c: int) -> Float[np.ndarray, "K"]:
-        """Returns of a cell that is a plane of its own, metres: their median is not too far off."""
+    def _dent(self, c: int) -> Float[np.ndarray, "K"] | None:
+        """Returns of a cell that is a plane of its own, metres; None where the density cuts them off."""
         at = self.pixels[c]
-        for _ in range(_CELL_TRIALS):
-            returns = self._returns(at, self._own_plane(c))
-            seen = returns > self.frame.front[at]
-            if seen.any() and -BAD_DEPTH < np.median((returns - self.scene.depth[at])[seen]) < SEEN_THROUGH:
-                return returns
-        return self._returns(at, self.scene.depth[at] - BAD_DEPTH * self.rng.random())
+        surface = self._own_plane(c) if self._standing(at) else None
+        if surface is None:
+            return None
+        returns = self._returns(at, surface)
+        seen = returns > self.frame.front[at]
+        within = seen.any() and -BAD_DEPTH < np.median((returns - self.scene.depth[at])[seen]) < SEEN_THROUGH
+        return returns if within else None
 
     def _standing(self, at) -> bool:
         """Whether the cell stands in front of the table: others have no planes of their own."""
@@ -402,13 +410,15 @@ class _ObjectCells:
         information = (phi.T * weight) @ phi + prior
         return np.linalg.solve(information, (phi.T * weight) @ returns + prior[0] * np.median(returns)), information
 
-    def _own_plane(self, c: int) -> Float[np.ndarray, "K"]:
-        """Depths of a cell that is a plane of its own, metres, as `own_plane.py` has it."""
+    def _own_plane(self, c: int) -> Float[np.ndarray, "K"] | None:
+        """Depths of a cell that is a plane of its own, metres, as `own_plane.py` has it; None where that is less than a
+        density."""
         depth, phi = self.scene.depth[self.pixels[c]], self._around_middle(c, c)
         others = [k for k in (self.beside.left[c], self.beside.above[c]) if k in self.planes]
-        anew = _NEW_PLANES * (_ANEW if others else 1.0)
-        if others and self.rng.random() * (anew + 1 - _ANEW) >= anew:
+        if others and self.rng.random() >= _ANEW:
             return phi @ self._gone_on(c, int(self.rng.choice(others)))
+        if self.rng.random() >= _NEW_PLANES:
+            return None
         own = phi @ np.append(0.0, _SLOPE_SD * self.rng.standard_normal(2))
         return own - np.median(own - depth) + self.rng.uniform(-BAD_DEPTH, SEEN_THROUGH)
 
