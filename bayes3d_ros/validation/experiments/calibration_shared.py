@@ -62,9 +62,10 @@ def steps(quick: bool) -> Iterator[Step]:
         yield row_step(shared_scene_row, k, problem)
 
 
-def shared_scene_row(k: int, problem: SharedProblem, **wrong: Any) -> Row:
-    """Draw scene k and its image, sample the posterior, and rank the truth in it. `wrong` (see `sample_shared_depth`)
-    makes images that are not of the density."""
+def shared_scene_row(k: int, problem: SharedProblem, noise_known: bool = False, **wrong: Any) -> Row:
+    """Draw scene k and its image, sample the posterior, and rank the truth in it. noise_known: the sampler is told sigma
+    and p_outlier, in place of nodes chosen from the image; `wrong` (see `sample_shared_depth`) makes images that are
+    not of the density."""
     scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SHARED_SEED), k))
     rng, drawn = np.random.default_rng((SHARED_SEED, k)), np.random.default_rng((SHARED_SEED, k, 1))
     objects, number = sample_scene(scene_key, problem.log_count, problem.library, problem.table)
@@ -72,11 +73,12 @@ def shared_scene_row(k: int, problem: SharedProblem, **wrong: Any) -> Row:
     errors = sample_errors(drawn, problem.amplitudes, sigmas, (0.0, MOST_OUTLIERS))
     scene = rendered(objects, number, problem)
     image = simulate_shared_image(drawn, scene, errors, problem, **wrong)
-    model = model_of(image, problem)
+    model = model_of(image, problem, errors if noise_known else None)
     start = time.perf_counter()
     posterior = run_shared_sampler(sample_key, image, model, problem)
     seconds = time.perf_counter() - start
-    truth = {"n": number, "sigma": errors.sigma, "p_outlier": errors.p_outlier}
+    noise = (float(np.float32(value)) for value in (errors.sigma, errors.p_outlier))  # as samples hold them
+    truth = {"n": number, **dict(zip(NOISE, noise, strict=True))}
     truth["log_likelihood"] = log_likelihood_of(objects, number, image, model, problem)
     types = int(problem.library.num_types)
     row = ranked(k, dict(truth), objects, posterior.samples, types, rng)

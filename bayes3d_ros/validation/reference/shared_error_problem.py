@@ -146,9 +146,15 @@ def image_of(depth: Float[np.ndarray, "H W"], problem: SharedProblem) -> ScoredI
     )
 
 
-def model_of(image: ScoredImage, problem: SharedProblem) -> SharedErrors:
-    """The model of an image of numpy arrays, on the device."""
+def model_of(image: ScoredImage, problem: SharedProblem, known: TrueErrors | None = None) -> SharedErrors:
+    """The model of an image of numpy arrays, on the device. known: the sampler is told sigma and p_outlier."""
     errors = shared_error_image(image, problem.amplitudes, problem.settings.sigma_max)
+    if known is not None:
+        pairs = len(errors.nodes.sigma)
+        sigma, p_outlier = (np.full(pairs, v, np.float32) for v in (known.sigma, known.p_outlier))
+        log_weight = np.repeat(errors.nodes.log_weight[:1], pairs, 0)
+        nodes = errors.nodes._replace(sigma=sigma, p_outlier=p_outlier, log_weight=log_weight)
+        errors = at_nodes(image, errors, nodes)
     return jax.device_put(shared_errors(image, errors))
 
 
