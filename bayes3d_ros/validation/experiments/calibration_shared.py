@@ -63,9 +63,10 @@ def steps(quick: bool) -> Iterator[Step]:
 
 
 def shared_scene_row(k: int, problem: SharedProblem, noise_known: bool = False, **wrong: Any) -> Row:
-    """Draw scene k and its image, sample the posterior, and rank the truth in it. noise_known: the sampler is told sigma
-    and p_outlier, in place of nodes chosen from the image; `wrong` (see `sample_shared_depth`) makes images that are
-    not of the density."""
+    """Draw scene k and its image, sample the posterior, and rank the truth in it.
+
+    noise_known: the sampler is told sigma and p_outlier, in place of nodes chosen from the image; `wrong` (see
+    `sample_shared_depth`) makes images that are not of the density."""
     scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SHARED_SEED), k))
     rng, drawn = np.random.default_rng((SHARED_SEED, k)), np.random.default_rng((SHARED_SEED, k, 1))
     objects, number = sample_scene(scene_key, problem.log_count, problem.library, problem.table)
