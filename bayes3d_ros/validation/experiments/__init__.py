@@ -16,6 +16,8 @@ EXPERIMENTS: dict[str, str] = {
     "additivity": "bayes3d_ros.validation.experiments.additivity",
     "calibration": "bayes3d_ros.validation.experiments.calibration",
     "calibration-points": "bayes3d_ros.validation.experiments.calibration_points",
+    "calibration-shared": "bayes3d_ros.validation.experiments.calibration_shared",
+    "calibration-shared-known-noise": "bayes3d_ros.validation.experiments.calibration_shared_known_noise",
     "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",
     "coverage": "bayes3d_ros.validation.experiments.coverage",
     "dial": "bayes3d_ros.validation.experiments.dial",
