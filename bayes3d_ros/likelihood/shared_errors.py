@@ -22,9 +22,9 @@ point as wide as its surface's errors make it and as likely as a blur of the ima
 off by a part of a pixel, and alike along an object), with a share for returns between the window's front and back, and,
 with probability pi, of the `BAD_DEPTH` in front of an object.
 
-Within two pixels of an outline a return may also lie anywhere (density `LOST_SHARE` edge_share / `LOST_DEPTH`; beyond
-the workspace: probability `LOST_SHARE` edge_share): cameras blur outlines, and lose thin parts. Nothing else excuses a
-return that is seen through an object.
+Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
+behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else
+excuses a return that is seen through an object.
 
 A return that stands by more than a margin in front of the scene, and of any object in its window, belongs to something
 unknown (`own_plane.py`); so does one beside it at which its depth goes on, behind an object of its window. Outlines of

@@ -54,7 +54,7 @@ class SurfaceCells(NamedTuple):
     residual: Float[np.ndarray, "C K"]  # metres: return - scene
     precision: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
     outlier: Float[np.ndarray, "C K"]  # density
-    lost: Float[np.ndarray, "C K"]  # density of a return near an outline that lies anywhere
+    lost: Float[np.ndarray, "C K"]  # density of a return near an outline that lies up to `LOST_DEPTH` behind
     real: Bool[np.ndarray, "C K"]
     label: Int[np.ndarray, "C"]
     middle: Float[np.ndarray, "C 2"]  # column and row
@@ -83,15 +83,15 @@ def modes(cells: SurfaceCells, sigma: float, p: float, starts: Float[np.ndarray,
     height = np.where(inliers > FEWEST_INLIERS, height, -np.inf)
     same = np.abs(place[0] - place[1]) * np.sqrt(curvature.min(0)) < SAME_MODE_SDS
     height[1] = np.where(same & np.isfinite(height[0]), -np.inf, height[1])
-    outliers = np.where(cells.real, np.log(np.where(cells.real, p * cells.outlier + cells.lost, 1)), 0).sum(1)
+    outliers = np.where(cells.real, np.log(np.where(cells.real, p * cells.outlier + (1 - p) * cells.lost, 1)), 0).sum(1)
     return CellModes(height, place, curvature, outliers)
 
 
 def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: float, steps: int):
     def parts(b):
         inlier = np.exp(-0.5 * (cells.residual - b[:, None]) ** 2 * cells.precision / sigma**2)
-        inlier = (1 - p) * inlier * np.sqrt(cells.precision / (2 * np.pi)) / sigma
-        total = p * cells.outlier + cells.lost + inlier
+        inlier = (1 - p) * (1 - cells.lost * LOST_DEPTH) * inlier * np.sqrt(cells.precision / (2 * np.pi)) / sigma
+        total = p * cells.outlier + (1 - p) * cells.lost + inlier
         return np.where(cells.real, inlier / total, 0), np.where(cells.real, np.log(np.where(cells.real, total, 1)), 0)
 
     for _ in range(steps):
@@ -130,6 +130,7 @@ def cells_of(
     count = np.maximum(real.sum(1), 1)
     middle = np.stack([spread(u).sum(1) / count, spread(v).sum(1) / count], 1)
     residual = spread(observed - depth[v, u], np.nan)
+    lost = kinds.near_outline[v, u] & (observed < depth[v, u] + LOST_DEPTH)
     median = np.nanmedian(residual, 1) if len(residual) else np.zeros(0)
     near = (median > -BAD_DEPTH) & (median < SEEN_THROUGH)
     own_plane = np.stack([spread(values).sum(1) for values in errors.own_plane[:, v, u].astype(np.float64)], 1)
@@ -137,7 +138,7 @@ def cells_of(
         np.nan_to_num(residual),
         spread(rays / errors.spread[v, u].astype(np.float64) ** 2, 1.0),
         spread(float(image.outlier_scale) * observed**2, 1.0),
-        spread(np.where(kinds.near_outline[v, u], lost_density(errors), 0.0)),
+        spread(np.where(lost, lost_density(errors), 0.0)),
         real,
         label[v, u][first],
         middle,
@@ -146,5 +147,5 @@ def cells_of(
 
 
 def lost_density(errors: SharedErrorImage) -> float:
-    """Of returns near outlines that lie anywhere, per metre."""
+    """Of returns near outlines that lie up to `LOST_DEPTH` behind, per metre."""
     return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_SHARE, SharedErrorImage
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SharedErrorImage
 from bayes3d_ros.likelihood.slow_cells import SurfaceCells, cells_of, lost_density, modes_at_nodes
 from bayes3d_ros.likelihood.slow_object_cells import log_object
 from bayes3d_ros.likelihood.slow_pixel_kinds import (
@@ -69,7 +69,8 @@ def log_edges(
     share, bad_share = float(amplitudes.edge_share), float(amplitudes.bad_share) * of_objects.any(0)
     mixture = (1 - bad_share) * mixture + bad_share * dented / BAD_DEPTH
     inside = np.where(any_surface, (1 - share) * mixture + share * between, outlier)
-    return np.log(p * outlier + np.where(any_surface, lost_density(errors), 0.0) + (1 - p) * inside)
+    lost = np.where(any_surface & (observed < front + LOST_DEPTH), lost_density(errors), 0.0)
+    return np.log(p * outlier + (1 - p) * (lost + (1 - lost * LOST_DEPTH) * inside))
 
 
 def log_unknown(

@@ -61,9 +61,10 @@ def _gather(
             precision = (f32(1.0) + x * x + y * y) / (spread * spread)
             batch.residual[at] = z - scene.depth[k]
             batch.precision[at] = precision
-            batch.root[at] = np.sqrt(precision * f32(1 / (2 * np.pi)))
+            lost_here = lost if scene.near_outline[k] != 0 and z < scene.depth[k] + f32(LOST_DEPTH) else f32(0.0)
+            batch.root[at] = (f32(1.0) - lost_here * f32(LOST_DEPTH)) * np.sqrt(precision * f32(1 / (2 * np.pi)))
             batch.outlier[at] = picture.outlier_scale * z * z
-            batch.lost[at] = lost if scene.near_outline[k] != 0 else f32(0.0)
+            batch.lost[at] = lost_here
             for s in range(len(planes) if label != TABLE else 0):
                 planes[s] += returns.own_plane[(s * returns.rows + v) * returns.columns + u]
             column, row = column + u, row + v

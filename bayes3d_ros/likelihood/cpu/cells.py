@@ -34,9 +34,9 @@ class Batch(NamedTuple):
 
     residual: Float[np.ndarray, "K*w"]
     precision: Float[np.ndarray, "K*w"]
-    root: Float[np.ndarray, "K*w"]  # of precision / 2 pi; 0 where there is no return
+    root: Float[np.ndarray, "K*w"]  # of precision / 2 pi, less for what may be lost; 0 where there is no return
     outlier: Float[np.ndarray, "K*w"]
-    lost: Float[np.ndarray, "K*w"]  # density of a return near an outline that lies anywhere
+    lost: Float[np.ndarray, "K*w"]  # density of a return near an outline that lies up to `LOST_DEPTH` behind
     label: Int[np.ndarray, "w"]
     place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a cell is added to
     column: Float[np.ndarray, "w"]  # mean place of its pixels
@@ -97,7 +97,7 @@ def _one_step(batch, returns, at, sigma, p):
             e, iv = residual[first + c], precision[first + c]
             off = e - place[at + c]
             inlier = norm * root[first + c] * exp(scale * off * off * iv)
-            share = inlier / (p * outlier[first + c] + lost[first + c] + inlier)
+            share = inlier / (p * outlier[first + c] + (f32(1.0) - p) * lost[first + c] + inlier)
             pull[c] += share * iv * e
             weight[at + c] += share * iv
             inliers[at + c] += share
@@ -132,7 +132,7 @@ def _look(batch, returns, at, sigma, p):
             iv = precision[first + c]
             off = residual[first + c] - place[at + c]
             real = root[first + c] > f32(0.0)
-            none = p * outlier[first + c] + lost[first + c]
+            none = p * outlier[first + c] + (f32(1.0) - p) * lost[first + c]
             inlier = norm * root[first + c] * exp(scale * off * off * iv)
             total = none + inlier
             share = inlier / total

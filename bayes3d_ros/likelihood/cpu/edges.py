@@ -51,7 +51,7 @@ def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes,
                 count += 1
     blur, bad, share = f32(amplitudes.edge_blur), f32(amplitudes.bad_share), f32(amplitudes.edge_share)
     dented = f32(1 / BAD_DEPTH) if (z < front) & (z > front - f32(BAD_DEPTH)) else f32(0.0)
-    lost = f32(LOST_SHARE / LOST_DEPTH) * share
+    lost = f32(LOST_SHARE / LOST_DEPTH) * share if z < front + f32(LOST_DEPTH) else f32(0.0)
     if blur > 0:
         for c in range(count):
             weights[c] = window[4][i32(weights[c]) - least]
@@ -73,7 +73,8 @@ def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes,
         behind = max(back, front + f32(4.0) * noise)
         between = f32(1.0) / (behind - front) if front < z < behind else f32(0.0)
         inside = (f32(1.0) - share) * mixture + share * between
-        values[s] = log(p * outlier + lost + (f32(1.0) - p) * inside)
+        inside = lost + (f32(1.0) - lost * f32(LOST_DEPTH)) * inside
+        values[s] = log(p * outlier + (f32(1.0) - p) * inside)
 
 
 @fast

@@ -9,11 +9,9 @@ An object's cells are drawn one after the other, each given the returns of the o
 approximation has them: so waves are of the very density that scores them (`whole_waves` draws the Gaussian process).
 
 What of the density is not normalised, over images of one scene (measured on the scenes of `calibration-shared`):
-- a return near an outline that lies anywhere adds `LOST_SHARE` edge_share / `LOST_DEPTH` = 0.17 a metre to a density
-  that integrates to one without it, from the margin in front of the scene to `far`. `lost_mass` is that integral, 0.03
-  to 0.1 a pixel within two of an outline: 20 to 55 nats an object, 0.05 to 0.2 nats of which change from sample to
-  sample of a posterior. Images are drawn from the density divided by its integral, so a sampler of the density itself
-  is given a factor too many;
+- a return near an outline may lie up to `LOST_DEPTH` behind its surface, uniformly; where that is beyond `far`, or in
+  front by up to the margin, the share of such returns, .05, is too little or too much of a density. `lost_mass` is what
+  this adds to the integral. Images are drawn from the density divided by its integral;
 - a return that stands in front of a scene by more than a margin is an outlier, and no part of a cell or an edge: what
   these say there is cut off. Margins are five standard deviations at least: less than 1e-6 a pixel;
 - planes of their own are about the median of their own returns (normal, 3 cm), and cut off where that is not within the
@@ -86,10 +84,11 @@ class TrueErrors(NamedTuple):
 
 
 class OutlineMass(NamedTuple):
-    """Where returns may lie anywhere."""
+    """Where returns near outlines may lie."""
 
     edge: Bool[np.ndarray, "*batch H W"]  # pixels whose window shows several surfaces
-    lost: Float[np.ndarray, "*batch H W"]  # what such returns add to a density of mass one
+    reach: Float[np.ndarray, "*batch H W"]  # metres over which such returns lie; 0 where there are none
+    lost: Float[np.ndarray, "*batch H W"]  # what they change of a density's mass of one
     front: Float[np.ndarray, "*batch H W"]  # metres: nearer returns are outliers
 
 
@@ -102,7 +101,7 @@ class _Frame(NamedTuple):
     errors: TrueErrors
     block: int
     noise: Float[np.ndarray, "H W"]  # metres: standard deviation of a return's depth
-    lost: Float[np.ndarray, "H W"]
+    reach: Float[np.ndarray, "H W"]
     front: Float[np.ndarray, "H W"]
 
 
@@ -134,23 +133,26 @@ def lost_mass(
     """Of scenes [*batch]: edges and the neighbours of edges as `kinds_of_pixels` has them, and what returns there that
     lie anywhere add to the density's integral. margin, far: metres."""
     several = label == NOTHING
-    front = depth.copy()
+    front, nearest = depth.copy(), depth.copy()
     has_object = np.zeros(depth.shape, bool)
     for dv, du in around():
         z, there = _beside(depth, dv, du, np.inf), _beside(label, dv, du, NOTHING)
         apart = max(abs(dv) / float(focal[1]), abs(du) / float(focal[0]))
         with np.errstate(invalid="ignore"):
             steep = np.abs(z - depth) > STEEPEST * apart * depth
+        nearest = np.minimum(nearest, z)
         several |= (there != NOTHING) & ((there != label) | steep)
         an_object = there >= OBJECT
         has_object |= an_object
         front = np.where(an_object, np.minimum(front, z), front)
+    behind = np.minimum(np.where(several, nearest, depth) + LOST_DEPTH, far)
     front = front - margin - np.where(has_object, BAD_DEPTH, 0.0)
     near = np.zeros(several.shape, bool)
     for dv, du in around():
         near |= _beside(several, dv, du, False)
-    density = LOST_SHARE * edge_share / LOST_DEPTH
-    return OutlineMass(several, np.where(near, density * np.maximum(far - front, 0.0), 0.0), front)
+    reach = np.where(near, np.maximum(behind - front, 0.0), 0.0)
+    lost = np.where(reach > 0, LOST_SHARE * edge_share * (reach / LOST_DEPTH - 1), 0.0)
+    return OutlineMass(several, reach, lost, front)
 
 
 def _beside(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
@@ -189,7 +191,7 @@ def sample_shared_depth(
         errors,
         max(LEAST_BLOCK, round(BLOCK_SIDE * float(rays.focal[0]) / reference)),
         noise_error * errors.sigma * spread / norm,
-        outlines.lost,
+        outlines.reach,
         outlines.front,
     )
     seen = np.full(depth.shape, np.nan)
@@ -208,12 +210,13 @@ def sample_shared_depth(
 def _with_outliers(rng: np.random.Generator, inliers: np.ndarray, frame: _Frame, at=np.s_[:]) -> np.ndarray:
     """Some of these returns lie anywhere. at: which pixels of the image these are."""
     near, far = frame.limits
-    lost, front = frame.lost[at], np.maximum(frame.front[at], near)
+    reach, front, p = frame.reach[at], np.maximum(frame.front[at], near), frame.errors.p_outlier
     anywhere = np.cbrt(near**3 + rng.random(inliers.shape) * (far**3 - near**3))
-    uniform = rng.random(inliers.shape) * (1 + lost)
-    p = frame.errors.p_outlier
-    found = np.where(uniform < p, anywhere, inliers)
-    return np.where(uniform > 1, front + rng.random(inliers.shape) * (far - front), found)
+    share = LOST_SHARE * float(frame.amplitudes.edge_share) * (reach > 0)
+    lost = (1 - p) * share * reach / LOST_DEPTH
+    uniform = rng.random(inliers.shape) * (p + lost + (1 - p) * (1 - share))
+    behind = front + rng.random(inliers.shape) * reach
+    return np.where(uniform < p, anywhere, np.where(uniform < p + lost, behind, inliers))
 
 
 def _edge_inliers(
@@ -383,7 +386,7 @@ class _ObjectCells:
         residual = (returns - self.scene.depth[at])[seen][None]
         shape = residual.shape
         noise = self.frame.noise[at][seen][None]
-        lost = np.where(self.frame.lost[at] > 0, LOST_SHARE * float(self.frame.amplitudes.edge_share) / LOST_DEPTH, 0)
+        lost = np.where(self.frame.reach[at] > 0, LOST_SHARE * float(self.frame.amplitudes.edge_share) / LOST_DEPTH, 0)
         cells = SurfaceCells(
             residual,
             (errors.sigma / noise) ** 2,
