@@ -36,8 +36,8 @@ CELL = 0.015  # metres, at most, of the first cells
 # Level by level: how many nats below the best a cell may be to be halved, and the share of the mass that the lightest
 # cells may hold together to be left whole. Middles of cells wider than a mode understate its flanks.
 LEVELS = ((200.0, 0.0), (60.0, 0.0), (30.0, 1e-6), (30.0, 1e-4), (30.0, 1e-3), (30.0, 1e-3))
-# Where pixels share errors the noise is small, and the likelihood jumps by nats where pixels become edges: once more.
-SHARED_LEVELS = (*LEVELS, (30.0, 0.005))
+# Where pixels share errors the noise is small, and the likelihood jumps by nats where pixels become edges: twice more.
+SHARED_LEVELS = (*LEVELS, (30.0, 0.005), (30.0, 0.005))
 Levels = tuple[tuple[float, float], ...]
 # Nats that the last halving, and the one before it, may move the evidence by for it to stand still. Two, because moves
 # change sign: one can be small by chance.
