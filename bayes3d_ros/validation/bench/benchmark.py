@@ -117,6 +117,12 @@ def ycb_library(types: tuple[str, ...], folder: Path, voxel_size: float = DEFAUL
     return folder
 
 
+def ten_ycb_types() -> Library:
+    """The library of `TEN_TYPES`. Raises MeshError where the meshes are not installed."""
+    with tempfile.TemporaryDirectory(prefix="bayes3d-ten-types-") as folder:
+        return load_library(ycb_library(TEN_TYPES, Path(folder)))
+
+
 def ycb_mesh(name: str) -> Path:
     """The mesh file of a YCB object. Raises MeshError where the meshes are not installed."""
     try:

@@ -6,7 +6,6 @@ The prior of one object is uniform over K types, so its evidence is Z = (1/K) su
 type t alone. A search for one type cannot lose it among others: where Z is smaller, the search for all types did.
 """
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -20,11 +19,10 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.plots import INK
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library
+from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.parsing import notes, recordings
 from bayes3d_ros.validation.experiments.planted import planted_scene, resting_types
@@ -45,8 +43,7 @@ def count(quick: bool) -> int:
 
 def steps(quick: bool) -> Iterator[Step]:
     """A row a frame."""
-    with tempfile.TemporaryDirectory(prefix="bayes3d-additivity-") as folder:
-        library = load_library(ycb_library(TEN_TYPES, Path(folder)))
+    library = ten_ycb_types()
     settings = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)
     whole = SceneParser(library, settings)
     each = [SceneParser(Library((model,)), settings) for model in library.models]

@@ -7,7 +7,6 @@ type fits what is seen of it), one known object (`known`), a dented one (`deform
 (`mixed`), and none, or known ones only (`empty`).
 """
 
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,11 +19,10 @@ import trimesh
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library, ycb_mesh
+from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ten_ycb_types, ycb_mesh
 from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.open_world_plot import plot
 from bayes3d_ros.validation.experiments.open_world_summary import summary
@@ -106,8 +104,7 @@ def _foreign(name: str) -> RestingObject:
 
 def ycb_world() -> YcbWorld:
     """The ten types as a library."""
-    with tempfile.TemporaryDirectory(prefix="bayes3d-open-world-") as folder:
-        return YcbWorld(load_library(ycb_library(TEN_TYPES, Path(folder))))
+    return YcbWorld(ten_ycb_types())
 
 
 def foreign_names() -> list[str]:

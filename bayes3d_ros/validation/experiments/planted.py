@@ -6,7 +6,6 @@ An independent renderer makes frames in which 5 to 40 % of an object's columns a
 sampler must report at least the evidence that is about the true pose, and no wrong type for certain.
 """
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,12 +19,11 @@ from matplotlib.figure import Figure
 from bayes3d_ros.io.plots import INK
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.observe import observe
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library
+from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.plot_style import label_plot, open_frame
 from bayes3d_ros.validation.reference.planted_evidence import ENOUGH, placement_of, planted_evidence
@@ -74,8 +72,7 @@ def count(quick: bool) -> int:
 def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
     settings = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)
-    with tempfile.TemporaryDirectory(prefix="bayes3d-planted-") as folder:
-        library = load_library(ycb_library(TEN_TYPES, Path(folder)))
+    library = ten_ycb_types()
     parser, arrays = SceneParser(library, settings), library_arrays(library)
     parser.warm_up(REALSENSE.width, REALSENSE.height)
     things = resting_types(library)
