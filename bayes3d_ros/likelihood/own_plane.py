@@ -5,12 +5,12 @@ likelihood of known objects, the shape integrated out.
 
 In each block of the image the surface is a plane of its own, about a surface that faces the camera,
 
-    d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `_DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
+    d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
 
-and its returns err as those of any surface do. With probability 1 - `_ANEW` a block goes on from the block to its left
+and its returns err as those of any surface do. With probability 1 - `ANEW` a block goes on from the block to its left
 or from the one above, where there are such: its plane is then that block's, as the returns of that block alone tell,
-turned by N(0, `_BEND_SD`^2) along either axis, half of it between the middles of the two, and displaced by
-N(0, `_STEP_SD`^2). So the density of a block's returns depends on those to its left and above alone, and the product
+turned by N(0, `BEND_SD`^2) along either axis, half of it between the middles of the two, and displaced by
+N(0, `STEP_SD`^2). So the density of a block's returns depends on those to its left and above alone, and the product
 over all blocks integrates to one over all depths.
 
 Each block's integral is worked out by Laplace's method about the plane that its returns make likeliest, for all that
@@ -26,11 +26,11 @@ from jaxtyping import Bool, Float, Int
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 # These change the posterior.
-_DEPTH_SD = 0.03  # metres
-_SLOPE_SD = 1.0
-_ANEW = 0.2
-_STEP_SD = 0.002  # metres
-_BEND_SD = 0.8
+DEPTH_SD = 0.03  # metres
+SLOPE_SD = 1.0
+ANEW = 0.2
+STEP_SD = 0.002  # metres
+BEND_SD = 0.8
 _STEPS = 6
 _FIRST_WIDTH = 0.004  # metres: of inliers in the first step; from step to step it shrinks to the noise's
 _MORE_STEPS = 3  # where a plane is followed from the one that is found without neighbours
@@ -136,14 +136,14 @@ def blocks_beside(column: Int[np.ndarray, "C"], row: Int[np.ndarray, "C"]) -> In
 def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray, "C"]:
     """Of each block's returns, given those of the blocks to its left and above."""
     count = len(blocks.middle)
-    prior = np.broadcast_to(np.diag([_DEPTH_SD**-2, _SLOPE_SD**-2, _SLOPE_SD**-2]), (count, 3, 3))
+    prior = np.broadcast_to(np.diag([DEPTH_SD**-2, SLOPE_SD**-2, SLOPE_SD**-2]), (count, 3, 3))
     alone = _planes(blocks, np.zeros((count, 3)), prior, noise, p, None)
     beside = (blocks.beside >= 0).sum(0)
-    parts = [alone.log_integral + np.log(np.where(beside > 0, _ANEW, 1.0))]
+    parts = [alone.log_integral + np.log(np.where(beside > 0, ANEW, 1.0))]
     for other in blocks.beside:
         mean, precision = _going_on(_Planes(*(a[other] for a in alone)), blocks, other)
         found = _planes(blocks, mean, precision, noise, p, alone.plane).log_integral
-        parts.append(np.where(other >= 0, found + np.log((1 - _ANEW) / np.maximum(beside, 1)), -np.inf))
+        parts.append(np.where(other >= 0, found + np.log((1 - ANEW) / np.maximum(beside, 1)), -np.inf))
     parts.append(np.where(blocks.real, np.log(p * blocks.outlier), 0).sum(1))  # all of them are outliers
     return np.logaddexp.reduce(parts)
 
@@ -157,7 +157,7 @@ def _going_on(
     move[:, 0, 1:], bend[:, 0, 1:] = apart, apart / 2
     mean = np.einsum("cde,ce->cd", move, planes.plane)
     mean[:, 0] += blocks.middle[other] - blocks.middle
-    change = np.diag([_STEP_SD**2, _BEND_SD**2, _BEND_SD**2])
+    change = np.diag([STEP_SD**2, BEND_SD**2, BEND_SD**2])
     covariance = move @ np.linalg.inv(planes.information) @ move.swapaxes(1, 2) + bend @ change @ bend.swapaxes(1, 2)
     return mean, np.linalg.inv(covariance)
 

@@ -66,7 +66,7 @@ SAME_MODE_SDS = 0.5  # standard deviations within which two modes are one
 # Scales of all amplitudes of objects: log normal, at the nodes of Gauss and Hermite.
 AMPLITUDE_LOG_SD = 0.6
 _SIGMA_NODES = (-0.8, 0.8)
-_HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
+HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
 _TABLE_SCALES = (0.6, 1.0, 1.7)
 
 
@@ -157,7 +157,7 @@ def _nodes(image, spread, inside, block: int, amplitudes: Amplitudes, sigma_max:
     tables = table * np.array(_TABLE_SCALES)
     wave = max(float(amplitudes.wave), 1e-9)
     log_table = -0.5 * (np.log(np.maximum(tables, 1e-9) / wave) / AMPLITUDE_LOG_SD) ** 2 - np.log(len(tables))
-    places, weights = _HERMITE
+    places, weights = HERMITE
     log_weight = log_noise[:, None] + (log_table[:, None] + np.log(weights)).ravel()
     return ErrorNodes(
         sigma.astype(np.float32),

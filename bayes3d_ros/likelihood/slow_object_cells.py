@@ -23,15 +23,16 @@ class Neighbours(NamedTuple):
     alike: Float[np.ndarray, "C 3"]  # with the left one, with the one above, of the two with each other
 
 
-def neighbours(cells: SurfaceCells, phi: Float[np.ndarray, "C 3"], block: int, length: float) -> Neighbours:
-    """phi: 1, x and y of each cell, metres; block: pixels a side; length: of the waves, metres."""
-    left, above = blocks_beside(*(cells.middle // block).astype(int).T)
+def neighbours(
+    column: Int[np.ndarray, "C"], row: Int[np.ndarray, "C"], phi: Float[np.ndarray, "C 3"], length: float
+) -> Neighbours:
+    """column, row: of each cell's block; phi: 1, x and y of each cell, metres; length: of the waves, metres."""
+    left, above = blocks_beside(column, row)
 
     def alike(one: Int[np.ndarray, "C"], other: Int[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
         apart = np.hypot(*(phi[one] - phi[other])[:, 1:].T)
         return np.where((one >= 0) & (other >= 0), np.exp(-apart / length), 0.0)
 
-    left, above = blocks_beside(*(cells.middle // block).astype(int).T)
     itself = np.arange(len(phi))
     return Neighbours(left, above, np.stack([alike(itself, left), alike(itself, above), alike(left, above)], 1))
 
@@ -90,7 +91,8 @@ def log_object(
     bad = found.bad(cells.own_plane[:, node])
     middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
     phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
-    beside = neighbours(cells, phi, int(errors.block), float(amplitudes.length))
+    column, row = (cells.middle // int(errors.block)).astype(int).T
+    beside = neighbours(column, row, phi, float(amplitudes.length))
 
     def log_cells(given: CellsGivenOthers, share: float):
         mean = given.known + given.phi @ a

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -45,16 +44,10 @@ def kinds_of_pixels(
     unknown = inside & stands_in_front(observed, depth, label, errors.table_margin)
     behind = observed < depth - errors.table_margin - np.where(label >= OBJECT, BAD_DEPTH, 0)
     unknown |= inside & behind & ~of_object & _goes_on(unknown, observed)
-    several = label == NOTHING
-    for dv, du in around():
-        z, there = shifted(depth, dv, du, np.inf), shifted(label, dv, du, NOTHING)
-        apart = max(abs(dv) / float(image.focal[1]), abs(du) / float(image.focal[0]))
-        with np.errstate(invalid="ignore"):
-            steep = np.abs(z - depth) > STEEPEST * apart * depth
-        several = several | ((there != NOTHING) & ((there != label) | steep))
+    several = shows_several(depth, label, np.asarray(image.focal))
     scored = inside & ~unknown
     hidden = (pixel_class == BEYOND) & rows & (depth < observed + float(image.front_margin))
-    near = ndimage.binary_dilation(several & rows, np.ones((3, 3)))
+    near = about(several & rows)
     return PixelKinds(unknown, scored & several, scored & ~several, near, hidden, of_object)
 
 
@@ -104,8 +97,29 @@ def around() -> list[tuple[int, int]]:
 
 
 def shifted(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
-    grown = np.pad(a, 1, constant_values=nothing)
-    return grown[1 + dv : 1 + dv + a.shape[0], 1 + du : 1 + du + a.shape[1]]
+    """What is so many rows and columns away in images [*batch, H, W]; `nothing` beyond their borders."""
+    height, width = a.shape[-2:]
+    grown = np.pad(a, [(0, 0)] * (a.ndim - 2) + [(1, 1), (1, 1)], constant_values=nothing)
+    return grown[..., 1 + dv : 1 + dv + height, 1 + du : 1 + du + width]
+
+
+def shows_several(
+    depth: Float[np.ndarray, "*batch H W"], label: Int[np.ndarray, "*batch H W"], focal: Float[np.ndarray, "2"]
+) -> Bool[np.ndarray, "*batch H W"]:
+    """Pixels whose windows show several surfaces, or whose own rays meet nothing."""
+    several = label == NOTHING
+    for dv, du in around():
+        z, there = shifted(depth, dv, du, np.inf), shifted(label, dv, du, NOTHING)
+        apart = max(abs(dv) / float(focal[1]), abs(du) / float(focal[0]))
+        with np.errstate(invalid="ignore"):
+            steep = np.abs(z - depth) > STEEPEST * apart * depth
+        several = several | ((there != NOTHING) & ((there != label) | steep))
+    return several
+
+
+def about(which: Bool[np.ndarray, "*batch H W"]) -> Bool[np.ndarray, "*batch H W"]:
+    """These pixels and those beside them."""
+    return np.any([shifted(which, dv, du, False) for dv, du in around()], axis=0)
 
 
 def mask_nats(unknown: Bool[np.ndarray, "H W"], of_object: Bool[np.ndarray, "H W"], image: ScoredImage) -> float:

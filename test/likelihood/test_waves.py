@@ -8,7 +8,6 @@ from scipy.stats import multivariate_normal
 
 from bayes3d_ros.likelihood import slow_cells
 from bayes3d_ros.likelihood import slow_object_cells as slow
-from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT
 
 WAVES, LENGTH, METRES = 0.0015**2, 0.05, 0.005  # variance, m; a pixel
 MODEL = 0.001**2
@@ -16,14 +15,11 @@ NOISE = 0.0004**2  # of a cell's mode
 BLOCK = 3
 
 
-def _cells(columns: int, rows: int) -> tuple[slow_cells.SurfaceCells, np.ndarray]:
-    """A grid of cells of one object, as blocks are numbered, and 1, x, y of each."""
+def _cells(columns: int, rows: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Columns and rows of a grid of cells of one object, as blocks are numbered, and 1, x, y of each."""
     row, column = (a.ravel() for a in np.indices((rows, columns)))
-    middle = np.stack([BLOCK * column + 1.0, BLOCK * row + 1.0], 1)
-    one = np.ones((len(middle), 1))
-    label = np.full(len(middle), OBJECT)
-    cells = slow_cells.SurfaceCells(one, one, one, one, one > 0, label, middle, np.full((len(middle), 1), -np.inf))
-    return cells, np.column_stack([one, METRES * (middle - middle.mean(0))])
+    middle = BLOCK * np.stack([column, row], 1)
+    return (column, row), np.column_stack([np.ones(len(middle)), METRES * (middle - middle.mean(0))])
 
 
 def _modes(place: np.ndarray, variance: float) -> slow_cells.CellModes:
@@ -36,7 +32,7 @@ def _modes(place: np.ndarray, variance: float) -> slow_cells.CellModes:
 
 def _log_density(place, phi, cells, variance, model):
     """log density of the cells' modes, of an object without a shared error."""
-    beside = slow.neighbours(cells, phi, BLOCK, LENGTH)
+    beside = slow.neighbours(*cells, phi, LENGTH)
     none = np.full(len(place), -np.inf)
     given = slow.given_others(_modes(place, variance), phi, np.zeros(3), model, WAVES, beside, 0.0, none)
     total = given.variance + variance
@@ -76,7 +72,7 @@ def test_they_leave_the_shared_error_as_uncertain_as_the_process_does():
     """Standard deviations of a bias and of slopes over the object, from cells given two others, are at least .6 and .85
     of the process's (two neighbours stand for all); from independent cells of the same variance .33 and .6."""
     cells, phi = _cells(8, 8)
-    beside = slow.neighbours(cells, phi, BLOCK, LENGTH)
+    beside = slow.neighbours(*cells, phi, LENGTH)
     none = np.full(64, -np.inf)
     modes = _modes(np.zeros(64), NOISE)
     given = slow.given_others(modes, phi, np.zeros(3), MODEL, WAVES, beside, 0.0, none)
@@ -91,7 +87,7 @@ def test_they_leave_the_shared_error_as_uncertain_as_the_process_does():
 def test_a_bad_cell_tells_its_neighbours_nothing():
     """A dent in the middle of a row: the cells after it are expected where the waves are without it."""
     cells, phi = _cells(7, 1)
-    beside = slow.neighbours(cells, phi, BLOCK, LENGTH)
+    beside = slow.neighbours(*cells, phi, LENGTH)
     place = np.zeros(7)
     place[3] = -0.012
     bad = np.full(7, -5.0)

@@ -14,7 +14,7 @@ from bayes3d_ros.validation.experiments import calibration_shared
 from bayes3d_ros.validation.experiments.calibration import LATENTS
 from bayes3d_ros.validation.reference.calibration_problem import Samples, small_library
 from bayes3d_ros.validation.reference.prior_predictive import sample_scene
-from bayes3d_ros.validation.reference.shared_error_predictive import TrueErrors
+from bayes3d_ros.validation.reference.shared_error_frame import TrueErrors
 from bayes3d_ros.validation.reference.shared_error_problem import (
     SharedPosterior,
     log_likelihood_of,

@@ -16,16 +16,15 @@ from bayes3d_ros.parsing.observe import amplitudes_of
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference import shared_error_problem
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
-from bayes3d_ros.validation.reference.shared_error_predictive import (
+from bayes3d_ros.validation.reference.shared_error_frame import (
     PinholeRays,
     RenderedScene,
     TrueErrors,
     lost_mass,
     margin_of,
-    sample_errors,
-    sample_shared_depth,
     spread_of,
 )
+from bayes3d_ros.validation.reference.shared_error_predictive import sample_errors, sample_shared_depth
 from bayes3d_ros.validation.reference.shared_error_problem import at_nodes, noise_posterior
 
 WIDTH, HEIGHT = 20, 15

@@ -33,9 +33,7 @@ class ObjectCells(NamedTuple):
     number: Float[np.ndarray, "M"]  # of returns
     x: Float[np.ndarray, "M"]  # metres from the middle
     y: Float[np.ndarray, "M"]
-    above: Int[
-        np.ndarray, "M"
-    ]  # which cell is in the block above; 0 where none is. The one to the left is the last one
+    above: Int[np.ndarray, "M"]  # the cell in the block above; 0 where none is. The one to the left is the last one
     alike_left: Float[np.ndarray, "M"]  # correlation of the waves with those of the cell to the left, 0 where none is,
     alike_above: Float[np.ndarray, "M"]  # and with those of the one above
     alike_both: Float[np.ndarray, "M"]  # of these two with each other

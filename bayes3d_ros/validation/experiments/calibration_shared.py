@@ -17,11 +17,13 @@ import numpy as np
 
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
+from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, line, plot, ranked
 from bayes3d_ros.validation.experiments.calibration import summary as summary_of
 from bayes3d_ros.validation.reference.prior_predictive import sample_scene
-from bayes3d_ros.validation.reference.shared_error_predictive import RenderedScene, TrueErrors, sample_errors
+from bayes3d_ros.validation.reference.shared_error_frame import RenderedScene, TrueErrors
+from bayes3d_ros.validation.reference.shared_error_predictive import sample_errors
 from bayes3d_ros.validation.reference.shared_error_problem import (
     SharedProblem,
     log_likelihood_of,
@@ -32,7 +34,6 @@ from bayes3d_ros.validation.reference.shared_error_problem import (
     run_shared_sampler,
     shared_problem,
     simulate_shared_image,
-    ten_types,
 )
 from bayes3d_ros.validation.statistics.ranks import uniformity
 
@@ -57,7 +58,7 @@ def count(quick: bool) -> int:
 
 def steps(quick: bool) -> Iterator[Step]:
     """A row a scene. Scene k is the same whatever their number."""
-    problem = shared_problem(ten_types())
+    problem = shared_problem(ten_ycb_types())
     for k in range(count(quick)):
         yield row_step(shared_scene_row, k, problem)
 

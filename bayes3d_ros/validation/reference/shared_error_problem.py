@@ -3,9 +3,7 @@
 """Ten YCB types on a table under errors that pixels share, as shipped: scenes of the prior, their images, and the
 posterior as one set of weighted scenes before anything is drawn after the weights."""
 
-import tempfile
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -29,6 +27,7 @@ from bayes3d_ros.likelihood.scene_score import pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
 from bayes3d_ros.likelihood.shared_errors import (
     AMPLITUDE_LOG_SD,
+    HERMITE,
     Amplitudes,
     ErrorNodes,
     SharedErrorImage,
@@ -40,29 +39,20 @@ from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.objects.placement import Table as PriorTable
-from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.observe import amplitudes_of
 from bayes3d_ros.parsing.rejuvenation import Effort
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ycb_library
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
-from bayes3d_ros.validation.reference.shared_error_predictive import (
-    PinholeRays,
-    RenderedScene,
-    TrueErrors,
-    lost_mass,
-    sample_shared_depth,
-)
+from bayes3d_ros.validation.reference.shared_error_frame import PinholeRays, RenderedScene, TrueErrors, lost_mass
+from bayes3d_ros.validation.reference.shared_error_predictive import sample_shared_depth
 
 SHARED_CAMERA = Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120)  # of a D435
-SHARED_DISTANCE, SHARED_ELEVATION = (
-    0.85,
-    np.radians(60),
-)  # metres from the table's middle; of the view below the horizon
+SHARED_DISTANCE = 0.85  # metres from the table's middle
+SHARED_ELEVATION = np.radians(60)  # of the view below the horizon
 SHARED_SETTINGS = ParserSettings(
     max_objects=3,
     count_ratio=1.0,
@@ -75,6 +65,8 @@ SHARED_SETTINGS = ParserSettings(
     particles=192,
     rejuvenated_objects=3,  # all of them: ranks are of copies that count once
 )
+
+_SIDE, _NOISE_ROUNDS, _REACH_SDS = 9, 5, 3.5  # of the grids on which noise is sought
 
 
 class SharedProblem(NamedTuple):
@@ -103,12 +95,6 @@ class SharedPosterior(NamedTuple):
         log_weight = np.where(weight > 0, np.log(np.maximum(weight, 1e-300)), -np.inf) - self.log_mass
         weight = np.exp(log_weight - log_weight.max())
         return self.samples._replace(weight=weight / weight.sum())
-
-
-def ten_types() -> Library:
-    """The library of ten YCB types. Raises MeshError where the meshes are not installed."""
-    with tempfile.TemporaryDirectory(prefix="bayes3d-calibration-") as folder:
-        return load_library(ycb_library(TEN_TYPES, Path(folder)))
 
 
 def shared_problem(library: Library, settings: ParserSettings = SHARED_SETTINGS) -> SharedProblem:
@@ -305,9 +291,6 @@ def noise_posterior(
     return NoisePosterior(sigma, _below(share.sum((1, 2))), p, _below(share.sum((0, 2))))
 
 
-_SIDE, _NOISE_ROUNDS, _REACH_SDS = 9, 5, 3.5
-
-
 def _below(share: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
     """Probability below the middle of each cell of a grid."""
     return np.cumsum(share) - share / 2
@@ -317,16 +300,13 @@ def _noise_grid(image, errors, scene: RenderedScene, axes) -> Float[np.ndarray, 
     """log of the posterior, per unit of log sigma, log p_outlier and log of the table's standard deviation."""
     sigma, p, table = axes
     pairs = [a.ravel() for a in np.meshgrid(sigma, p, indexing="ij")]
-    scales, log_scale = np.asarray(errors.nodes.scale), np.log(_SCALE_WEIGHTS)
+    scales, log_scale = np.asarray(errors.nodes.scale), np.log(HERMITE[1])
     nodes = ErrorNodes(pairs[0], pairs[1], table, scales, np.zeros((len(pairs[0]), len(table) * len(scales))))
     found = log_density(scene.depth, scene.label, image, at_nodes(image, errors, nodes))
     found = logsumexp(found.reshape(len(sigma), len(p), len(table), -1) + log_scale, -1)
     wave = float(errors.amplitudes.wave)
     log_prior = -0.5 * (np.log(table / wave) / AMPLITUDE_LOG_SD) ** 2
     return found + np.log(sigma)[:, None, None] + np.log(p)[:, None] + log_prior
-
-
-_SCALE_WEIGHTS = np.array([1 / 6, 2 / 3, 1 / 6])  # of Gauss and Hermite
 
 
 def at_nodes(image: ScoredImage, errors: SharedErrorImage, nodes: ErrorNodes) -> SharedErrorImage:
