@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayes3d_ros.likelihood import noise_marginal
 from bayes3d_ros.likelihood.backends import shared_kernel
 from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.error_nodes import sample_noise_at
 from bayes3d_ros.likelihood.hypotheses import SceneDepths
 from bayes3d_ros.likelihood.noise_marginal import NoiseGrid
 from bayes3d_ros.likelihood.scene_score import (
@@ -125,7 +126,4 @@ def sample_noise(key: PRNGKeyArray, model: ImageModel, loglik_grid: Float[Array,
     """sigma and p_outlier of each scene, given the image."""
     if isinstance(model, NoiseGrid):
         return noise_marginal.sample(key, loglik_grid, model)
-    nodes = model.image.nodes
-    log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1)
-    node = jax.random.categorical(key, log_mass)
-    return Noise(jnp.asarray(nodes.sigma)[node], jnp.asarray(nodes.p_outlier)[node])
+    return sample_noise_at(key, model.image.nodes, loglik_grid)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import log_ndtr
 
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import (
@@ -18,6 +19,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     MORE_MODE_STEPS,
     SAME_MODE_SDS,
     SEEN_THROUGH,
+    SEEN_THROUGH_NATS,
     SharedErrorImage,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import PixelKinds
@@ -42,9 +44,10 @@ class CellModes(NamedTuple):
     def bad(self, own_plane: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
         """log of the mean of the integral over b uniform in the `BAD_DEPTH` towards the camera, and of what planes of
         the cells' own say."""
-        within = (self.place < 0) & (self.place > -BAD_DEPTH)
-        width = 0.5 * np.log(2 * np.pi / np.maximum(self.curvature, 1e-12)) - np.log(BAD_DEPTH)
-        offset = np.logaddexp.reduce(np.where(within, self.height + width, -np.inf))
+        root = np.sqrt(np.maximum(self.curvature, 1e-12))
+        within = log_ndtr(-self.place * root) + log_ndtr((self.place + BAD_DEPTH) * root)  # its ends are far apart
+        width = 0.5 * np.log(2 * np.pi) - np.log(root) - np.log(BAD_DEPTH)
+        offset = np.logaddexp.reduce(self.height + width + within)
         return np.logaddexp(np.logaddexp(offset, own_plane) - np.log(2), self.outliers)
 
 
@@ -58,7 +61,7 @@ class SurfaceCells(NamedTuple):
     real: Bool[np.ndarray, "C K"]
     label: Int[np.ndarray, "C"]
     middle: Float[np.ndarray, "C 2"]  # column and row
-    own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own, -inf where it may have none
+    own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own
 
 
 def modes_at_nodes(cells: SurfaceCells, errors: SharedErrorImage) -> list[CellModes]:
@@ -132,7 +135,7 @@ def cells_of(
     residual = spread(observed - depth[v, u], np.nan)
     lost = kinds.near_outline[v, u] & (observed < depth[v, u] + LOST_DEPTH)
     median = np.nanmedian(residual, 1) if len(residual) else np.zeros(0)
-    near = (median > -BAD_DEPTH) & (median < SEEN_THROUGH)
+    behind = SEEN_THROUGH_NATS * np.maximum(median - SEEN_THROUGH, 0)
     own_plane = np.stack([spread(values).sum(1) for values in errors.own_plane[:, v, u].astype(np.float64)], 1)
     return SurfaceCells(
         np.nan_to_num(residual),
@@ -142,7 +145,7 @@ def cells_of(
         real,
         label[v, u][first],
         middle,
-        np.where(near[:, None], own_plane, -np.inf),
+        own_plane - behind[:, None],
     )
 
 

@@ -8,8 +8,9 @@ from scipy.stats import kstest
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.error_nodes import ErrorNodes
 from bayes3d_ros.likelihood.scored_image import scored_image
-from bayes3d_ros.likelihood.shared_errors import BLOCK_SIDE, ErrorNodes, shared_error_image
+from bayes3d_ros.likelihood.shared_errors import BLOCK_SIDE, shared_error_image
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT, TABLE, kinds_of_pixels
 from bayes3d_ros.likelihood.slow_shared_errors import log_density
 from bayes3d_ros.parsing.observe import amplitudes_of
@@ -53,14 +54,14 @@ def image_of(depth):
 
 def log_value(image, scene, errors, amplitudes):
     """log density, with the margin of ERRORS: what is told apart is not the margin."""
-    margin = margin_of(ERRORS, spread_of(scene.depth))
+    margin = margin_of(ERRORS, spread_of(scene))
     shared = shared_error_image(image, amplitudes, SIGMA_MAX)._replace(table_margin=margin)
     nodes = ErrorNodes(*(np.array([value]) for value in (*errors,)), np.zeros((1, 1)))
     return log_density(scene.depth, scene.label, image, at_nodes(image, shared, nodes))[0, 0]
 
 
 def log_mass(scene, errors=ERRORS):
-    margin = margin_of(ERRORS, spread_of(scene.depth))
+    margin = margin_of(ERRORS, spread_of(scene))
     lost = lost_mass(scene.depth, scene.label, FOCAL, margin, LIMITS.far, 0.1).lost
     return np.log1p((1 - errors.p_outlier) * lost).sum()
 

@@ -11,7 +11,7 @@ from bayes3d_ros.likelihood.cpu.compiling import strict
 from bayes3d_ros.likelihood.cpu.edges import log_edge
 from bayes3d_ros.likelihood.cpu.patches import CELL, EDGE, HIDDEN, NEW, OLD, TABLE, UNKNOWN
 from bayes3d_ros.likelihood.cpu.windows import log
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SEEN_THROUGH
+from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE, SEEN_THROUGH, SEEN_THROUGH_NATS
 
 
 @strict
@@ -71,9 +71,9 @@ def _gather(
             count += 1
     median = _median(batch.residual, used, count, returns_sorted)
     batch.start[used] = median
-    near = (median > f32(-BAD_DEPTH)) & (median < f32(SEEN_THROUGH)) & (label != TABLE)
+    behind = f32(SEEN_THROUGH_NATS) * max(median - f32(SEEN_THROUGH), f32(0.0))
     for s in range(len(batch.own_plane) // w):
-        batch.own_plane[s * w + used] = planes[s] if near else NO_MODE
+        batch.own_plane[s * w + used] = planes[s] - behind if label != TABLE else NO_MODE
     batch.label[used], batch.place_of_sum[used] = label, place_of_sum
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
 

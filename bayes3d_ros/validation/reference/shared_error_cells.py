@@ -14,6 +14,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     LOST_DEPTH,
     LOST_SHARE,
     SEEN_THROUGH,
+    SEEN_THROUGH_NATS,
 )
 from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells, modes
 from bayes3d_ros.likelihood.slow_object_cells import neighbours
@@ -26,8 +27,8 @@ from bayes3d_ros.validation.reference.shared_error_frame import (
     with_outliers,
 )
 
-_NEW_PLANES = (BAD_DEPTH + SEEN_THROUGH) / (np.sqrt(2 * np.pi) * DEPTH_SD)  # what is left of their mass
-_CELL_TRIALS = 20
+_NEAREST, _FARTHEST = -BAD_DEPTH - 0.03, SEEN_THROUGH + 5 / SEEN_THROUGH_NATS  # metres from the scene, of new planes
+_NEW_PLANES = (_FARTHEST - _NEAREST) / (np.sqrt(2 * np.pi) * DEPTH_SD)  # their mass, before what is cut off
 
 
 class DrawnCells:
@@ -86,16 +87,9 @@ class DrawnCells:
             self._tell(c, returns, mean, variance, plane)
 
     def _displaced(self, c: int) -> Float[np.ndarray, "K"]:
-        """Returns of a cell that is off as a whole, metres: their mode is uniform in the `BAD_DEPTH` towards the
-        camera, which cuts the density off."""
+        """Returns of a cell that is off as a whole, metres."""
         at = self.pixels[c]
-        wide = 3 * float(self.frame.noise[at].mean())
-        for _ in range(_CELL_TRIALS):
-            returns = self._returns(at, self.scene.depth[at] + self.rng.uniform(-BAD_DEPTH - wide, wide))
-            found = self._modes(c, returns)
-            if found is not None and -BAD_DEPTH < found.place[int(np.argmax(found.height[:, 0])), 0] < 0:
-                break
-        return returns
+        return self._returns(at, self.scene.depth[at] - BAD_DEPTH * self.rng.random())
 
     def _returns(self, at, depth: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
         """Of a surface at these depths, metres."""
@@ -110,12 +104,14 @@ class DrawnCells:
             return None
         returns = self._returns(at, surface)
         seen = returns > self.frame.front[at]
-        within = seen.any() and -BAD_DEPTH < np.median((returns - self.scene.depth[at])[seen]) < SEEN_THROUGH
-        return returns if within else None
+        if not seen.any():
+            return None
+        behind = max(np.median((returns - self.scene.depth[at])[seen]) - SEEN_THROUGH, 0.0)
+        return returns if self.rng.random() < np.exp(-SEEN_THROUGH_NATS * behind) else None
 
     def _standing(self, at) -> bool:
         """Whether the cell stands in front of the table: others have no planes of their own."""
-        margin = margin_of(self.frame.errors, spread_of(self.scene.depth)[at])
+        margin = margin_of(self.frame.errors, spread_of(self.scene)[at])
         return bool((self.scene.depth[at] < self.scene.bare[at] - margin).all())
 
     def _given_others(self, c: int) -> tuple[float, float]:
@@ -197,7 +193,7 @@ class DrawnCells:
         if self.rng.random() >= _NEW_PLANES:
             return None
         own = phi @ np.append(0.0, SLOPE_SD * self.rng.standard_normal(2))
-        return own - np.median(own - depth) + self.rng.uniform(-BAD_DEPTH, SEEN_THROUGH)
+        return own - np.median(own - depth) + self.rng.uniform(_NEAREST, _FARTHEST)
 
     def _gone_on(self, c: int, other: int) -> Float[np.ndarray, "3"]:
         """The plane of a neighbour, turned and displaced, about the middle of the cell c."""

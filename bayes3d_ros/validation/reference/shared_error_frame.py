@@ -19,7 +19,7 @@ from bayes3d_ros.likelihood.shared_errors import (
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, about, around, shifted, shows_several
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
 
-_HIGHEST_NODE = 1.083  # the largest of an image's nodes of sigma, which makes the margin, in units of sigma
+_HIGHEST_NODE = 1.005  # the largest of an image's nodes of sigma, which makes the margin, in units of sigma
 
 
 class PinholeRays(NamedTuple):
@@ -41,7 +41,7 @@ class RenderedScene(NamedTuple):
 class TrueErrors(NamedTuple):
     """Parameters of an image's errors."""
 
-    sigma: float  # metres, at the median depth
+    sigma: float  # metres, at the bare table's median depth
     p_outlier: float
     table: float  # metres: standard deviation of the table's cells
     scale: float  # of objects' amplitudes
@@ -69,9 +69,14 @@ class ErrorFrame(NamedTuple):
     front: Float[np.ndarray, "H W"]
 
 
-def spread_of(depth: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Standard deviation of returns at these depths over that at their median, as `shared_error_image` has it."""
-    reference = np.median(depth[np.isfinite(depth)])
+def reference_depth(scene: RenderedScene) -> float:
+    """Metres: the bare table's median, at which sigma is told."""
+    return float(np.median(scene.bare[np.isfinite(scene.bare)]))
+
+
+def spread_of(scene: RenderedScene) -> Float[np.ndarray, "H W"]:
+    """Standard deviation of returns over that at the reference depth, as `shared_error_image` has it."""
+    depth, reference = scene.depth, reference_depth(scene)
     return np.sqrt(0.5 + 0.5 * (np.where(np.isfinite(depth), depth, reference) / reference) ** 4)
 
 

@@ -14,11 +14,8 @@ What of the density is not normalised, over images of one scene (measured on the
   this adds to the integral. Images are drawn from the density divided by its integral;
 - a return that stands in front of a scene by more than a margin is an outlier, and no part of a cell or an edge: what
   these say there is cut off. Margins are five standard deviations at least: less than 1e-6 a pixel;
-- planes of their own are about the median of their own returns (normal, 3 cm), and cut off where that is not within the
-  3 cm that a bad cell may be off: 0.4 of their mass is left where they begin anew (`_NEW_PLANES` in
-  `shared_error_cells.py`), 0.8 where they go on from a neighbour (measured). So a cell has 0.6 % too little mass at a
-  `bad_share` of .04: a nat an object. At these cuts the density jumps, by what it costs that all returns of a cell are
-  outliers: by 70 nats from one pose to another 0.1 mm away, where a cell is 2 cm in front (sigma 1.2 mm, 5 % outliers);
+- planes of their own are about the median of their own returns (normal, 3 cm), and rarer where that is behind the
+  scene by more than `SEEN_THROUGH`: so a cell has up to 1 % too little mass at a `bad_share` of .04;
 - noise is as wide as the *observed* depth makes it: 2 sigma / z, less than 1 % of a standard deviation.
 What is drawn only nearly: planes of their own go on from the plane of the neighbour's inliers, which the density finds
 by reweighting; and whether a neighbour is good is told without them.
@@ -27,8 +24,8 @@ by reweighting; and whether a neighbour is good is told without them.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD
 from bayes3d_ros.likelihood.shared_errors import (
-    AMPLITUDE_LOG_SD,
     BAD_DEPTH,
     BLOCK_SIDE,
     LEAST_BLOCK,
@@ -44,6 +41,7 @@ from bayes3d_ros.validation.reference.shared_error_frame import (
     TrueErrors,
     lost_mass,
     margin_of,
+    reference_depth,
     spread_of,
     with_outliers,
 )
@@ -73,16 +71,15 @@ def sample_shared_depth(
     """A depth image of this scene, metres, in which every pixel returned. noise_error: pixels' own noise is so many
     times what the errors say; whole_waves: waves are a Gaussian process, not its approximation."""
     depth, label, _ = scene
-    spread = spread_of(depth)
+    spread = spread_of(scene)
     outlines = lost_mass(depth, label, rays.focal, margin_of(errors, spread), limits.far, float(amplitudes.edge_share))
-    reference = float(np.median(depth[np.isfinite(depth)]))
     norm = np.sqrt(1 + rays.x**2 + rays.y[:, None] ** 2)
     frame = ErrorFrame(
         rays,
         limits,
         amplitudes,
         errors,
-        max(LEAST_BLOCK, round(BLOCK_SIDE * float(rays.focal[0]) / reference)),
+        max(LEAST_BLOCK, round(BLOCK_SIDE * float(rays.focal[0]) / reference_depth(scene))),
         noise_error * errors.sigma * spread / norm,
         outlines.reach,
         outlines.front,

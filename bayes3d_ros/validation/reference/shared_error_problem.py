@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, HERMITE, ErrorNodes
 from bayes3d_ros.likelihood.image_model import (
     SharedErrors,
     gain,
@@ -26,10 +27,7 @@ from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scene_score import pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
 from bayes3d_ros.likelihood.shared_errors import (
-    AMPLITUDE_LOG_SD,
-    HERMITE,
     Amplitudes,
-    ErrorNodes,
     SharedErrorImage,
     shared_error_image,
 )

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Where the parameters of an image's errors are summed over (`shared_errors.py`): sigma, p_out, the standard deviation
+tau of the table's cells, and the scale of objects' amplitudes.
+
+The table's returns nearly settle the first three: log sigma to a percent or less. So the posterior that they alone
+give is found first, as a normal density of log sigma, logit p_out and log tau, by expectation and maximisation over
+the offsets of the table's cells and over which returns are outliers. Its rule of Gauss and Hermite then gives the
+nodes, two of log sigma and of logit p_out and three of log tau. Every scene's own likelihood weighs them: what
+objects' returns say of the noise counts too.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.scored_image import ScoredImage
+
+# Scales of all amplitudes of objects, and the table's tau about `wave`: log normal.
+AMPLITUDE_LOG_SD = 0.6
+HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
+_PAIRS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # standard deviations of log sigma, logit p_out
+_STANDING = 0.008  # metres in front of the table from which returns that touch are an object's
+_LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
+_FEWEST_CELLS = 10
+_STEPS = 12
+_MOST_SDS = 3.0  # by which a scene's noise is moved away from what the table tells
+_WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations where the table tells nothing
+
+
+class ErrorNodes(NamedTuple):
+    """S pairs of noise, T amplitudes of the table, A scales of objects' amplitudes, all with all."""
+
+    sigma: Float[np.ndarray, "S"]  # metres, at the reference depth
+    p_outlier: Float[np.ndarray, "S"]
+    table: Float[np.ndarray, "T"]  # metres
+    scale: Float[np.ndarray, "A"]
+    log_weight: Float[np.ndarray, "S TA"]
+
+
+class TableErrors(NamedTuple):
+    """What the table's returns tell of log sigma, logit p_out and log tau: normal, of independent parts."""
+
+    mean: Float[np.ndarray, "3"]
+    sd: Float[np.ndarray, "3"]
+
+
+class _TableCells(NamedTuple):
+    """Returns of C blocks of the table; beyond them `real` is false."""
+
+    residual: Float[np.ndarray, "C K"]  # metres: return - table
+    precision: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
+    outlier: Float[np.ndarray, "C K"]  # density
+    real: Bool[np.ndarray, "C K"]
+
+
+def error_nodes(
+    image: ScoredImage,
+    inside: Bool[np.ndarray, "H W"],
+    spread: Float[np.ndarray, "H W"],
+    block: int,
+    wave: float,
+    sigma_max: float,
+) -> ErrorNodes:
+    """Nodes of an image of numpy arrays. inside: returns in the workspace; block: pixels a side; wave: metres, the
+    median of tau's prior, 0 where the table has no errors of its own; sigma_max: metres, the end of sigma's prior."""
+    told = table_errors(_table_cells(image, inside, spread, block), wave, sigma_max)
+    (log_sigma, logit_p, log_table), (sd_sigma, sd_p, sd_table) = told
+    sigma = np.minimum(np.exp(log_sigma + sd_sigma * _PAIRS[:, 0]), sigma_max)
+    p_outlier = 1 / (1 + np.exp(-logit_p - sd_p * _PAIRS[:, 1]))
+    # Priors uniform in sigma and p_out, over the normal density whose rule this is, at places as likely as each other.
+    log_noise = np.log(sigma / sigma_max * p_outlier * (1 - p_outlier) * sd_sigma * sd_p)
+    places, weights = HERMITE
+    tables = np.exp(log_table + sd_table * places) if wave > 0 else np.zeros(len(places))
+    log_tables = np.log(weights)
+    if wave > 0:
+        log_tables = log_tables + 0.5 * places**2 - 0.5 * ((np.log(tables / wave)) / AMPLITUDE_LOG_SD) ** 2
+    log_weight = log_noise[:, None] + (log_tables[:, None] + np.log(weights)).ravel()
+    scale = np.exp(AMPLITUDE_LOG_SD * places)
+    return ErrorNodes(*(a.astype(np.float32) for a in (sigma, p_outlier, tables, scale, log_weight)))
+
+
+def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErrors:
+    """By expectation and maximisation; the standard deviations are those of the information that is not missing.
+    Metres."""
+    least = np.log([_LEAST_SIGMA, 1e-5, _LEAST_TABLE])
+    prior = np.array([np.log(sigma_max / 3), np.log(0.01 / 0.99), np.log(max(wave, _LEAST_TABLE))])
+    if len(cells.real) < _FEWEST_CELLS:  # the table is hardly seen
+        return TableErrors(prior, _WIDEST)
+    scaled = np.where(cells.real, cells.residual * np.sqrt(cells.precision), np.nan)
+    middle = np.nanmedian(scaled, 1, keepdims=True)
+    mean = np.maximum(np.log([1.4826 * np.nanmedian(np.abs(scaled - middle)) + 1e-9, 0.01, max(wave, 1e-9)]), least)
+    offset = np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1)
+    for _ in range(_STEPS):
+        sigma, p, table = np.exp(mean[0]), 1 / (1 + np.exp(-mean[1])), np.exp(mean[2])
+        tie = table**-2 if wave > 0 else 1e16
+        off2 = np.square(cells.residual - offset[:, None]) * cells.precision / sigma**2
+        inlier = (1 - p) * np.exp(-0.5 * off2) * np.sqrt(cells.precision / (2 * np.pi)) / sigma
+        share = np.where(cells.real, inlier / (inlier + p * cells.outlier), 0.0)
+        weight = share * cells.precision / sigma**2
+        told = weight.sum(1)
+        offset, variance = (weight * cells.residual).sum(1) / (told + tie), 1 / (told + tie)
+        inliers, returns = share.sum(), cells.real.sum()
+        square = np.square(cells.residual - offset[:, None]) + variance[:, None]
+        mean[0] = 0.5 * np.log((share * cells.precision * square).sum() / inliers)
+        mean[1] = np.log((returns - inliers + 1) / (inliers + 1))
+        if wave > 0:
+            # A step of Newton's on the log posterior of log tau, whose information the offsets' own is not part of.
+            excess = np.exp(-2 * mean[2]) * (offset**2 + variance).sum()
+            pull = excess - len(offset) - (mean[2] - prior[2]) / AMPLITUDE_LOG_SD**2
+            information = 2 * np.square(1 - variance * tie).sum() + AMPLITUDE_LOG_SD**-2
+            mean[2] += np.clip(pull / information, -0.5, 0.5)
+        mean = np.clip(mean, least, np.log([sigma_max, 1e5, 1.0]))
+    # Louis' formula (1982): of complete data, less the variance of what is not known, namely which are outliers.
+    unsure = share * (1 - share)
+    tied = 1 - variance * tie  # the share of each cell's offset that its returns settle
+    of_sigma = 2 * (inliers - tied.sum()) - (unsure * np.square(off2 - 1)).sum()
+    of_p = (returns - inliers) * inliers / returns - unsure.sum()
+    information = [of_sigma, max(of_p, 1.0), 2 * (tied**2).sum() + AMPLITUDE_LOG_SD**-2]
+    return TableErrors(mean, np.minimum(np.maximum(information, 1e-9) ** -0.5, _WIDEST))
+
+
+def _table_cells(image: ScoredImage, inside, spread, block: int) -> _TableCells:
+    """Blocks of returns where nothing seems to stand on the table."""
+    depth, bare = np.asarray(image.depth, np.float64), np.asarray(image.bare_depth, np.float64)
+    on_table = np.isfinite(bare)
+    standing = inside & (depth < np.where(on_table, bare, np.inf) - _STANDING)
+    four = standing[1:, 1:] & standing[1:, :-1] & standing[:-1, 1:] & standing[:-1, :-1]
+    near = _grown(np.pad(four, ((0, 1), (0, 1))), 5)
+    own = inside & ~near & ~_grown(~on_table, 1)
+    norm2 = 1 + np.asarray(image.ray_x, np.float64) ** 2 + np.asarray(image.ray_y, np.float64)[:, None] ** 2
+    height, width = depth.shape[0] // block * block, depth.shape[1] // block * block
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        cut = values[:height, :width].reshape(height // block, block, width // block, block)
+        return cut.swapaxes(1, 2).reshape(-1, block * block)
+
+    real = blocks(own)
+    enough = real.mean(1) >= 0.5
+    residual = blocks(np.where(own, depth - np.where(on_table, bare, 0.0), 0.0))
+    precision, outlier = blocks(norm2 / spread.astype(np.float64) ** 2), float(image.outlier_scale) * depth**2
+    return _TableCells(*(a[enough] for a in (residual, precision, blocks(np.where(own, outlier, 1.0)), real)))
+
+
+def _grown(which: Bool[np.ndarray, "H W"], by: int) -> Bool[np.ndarray, "H W"]:
+    """These pixels, and those within so many rows and columns of them."""
+    for axis in (0, 1):
+        padded = np.pad(which, [(by, by) if axis == a else (0, 0) for a in (0, 1)])
+        size = which.shape[axis]
+        which = np.any([np.take(padded, np.arange(k, k + size), axis) for k in range(2 * by + 1)], axis=0)
+    return which
+
+
+def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S TA"]) -> Noise:
+    """sigma and p_outlier of each scene given the image: the table's normal density, moved by what the scene's own
+    likelihood at the four pairs of nodes adds to the table's."""
+    log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1).reshape(-1, 2, 2)
+    of_sigma, of_p = (jax.nn.logsumexp(log_mass, axis) for axis in (2, 1))
+    moved = jnp.stack([0.5 * (a[:, 1] - a[:, 0]) for a in (of_sigma, of_p)], -1)
+    normal = jnp.clip(moved, -_MOST_SDS, _MOST_SDS) + jax.random.normal(key, moved.shape)
+    log_sigma = jnp.log(jnp.asarray(nodes.sigma))[jnp.array([0, 3])]
+    logit_p = jax.scipy.special.logit(jnp.asarray(nodes.p_outlier))[jnp.array([0, 3])]
+    middle, sd = ((a[0] + a[1]) / 2 for a in (log_sigma, logit_p)), ((a[1] - a[0]) / 2 for a in (log_sigma, logit_p))
+    sigma, p_outlier = (m + s * normal[:, k] for k, (m, s) in enumerate(zip(middle, sd, strict=True)))
+    return Noise(jnp.exp(sigma), jax.nn.sigmoid(p_outlier))

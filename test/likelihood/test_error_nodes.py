@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the table's returns tell of an image's errors, against closed forms and a fine grid; and the noise drawn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayes3d_ros.likelihood.error_nodes import (
+    HERMITE,
+    ErrorNodes,
+    _table_cells,
+    _TableCells,
+    error_nodes,
+    sample_noise_at,
+    table_errors,
+)
+from bayes3d_ros.likelihood.shared_errors import shared_error_image
+from bayes3d_ros.validation.reference.calibration_problem import small_library
+from bayes3d_ros.validation.reference.prior_predictive import sample_scene
+from bayes3d_ros.validation.reference.shared_error_frame import TrueErrors
+from bayes3d_ros.validation.reference.shared_error_problem import (
+    noise_posterior,
+    rendered,
+    shared_problem,
+    simulate_shared_image,
+)
+
+SIGMA_MAX = 0.005
+
+
+def logit(p):
+    return np.log(p / (1 - p))
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return shared_problem(small_library())
+
+
+def test_without_outliers_it_is_the_analysis_of_variance():
+    """Balanced cells: within, a sum of squares with C (K - 1) degrees of freedom; the cells' means, variance
+    sigma^2 / K + tau^2."""
+    rng, count, size, sigma, table = np.random.default_rng(3), 1200, 9, 0.001, 0.0015
+    residual = table * rng.standard_normal((count, 1)) + sigma * rng.standard_normal((count, size))
+    ones = np.ones(residual.shape)
+    found = table_errors(_TableCells(residual, ones, 1e-9 * ones, ones > 0), 0.001, SIGMA_MAX)
+    mean = residual.mean(1)
+    within = np.square(residual - mean[:, None]).sum() / (count * (size - 1))
+    between = np.square(mean).mean() - within / size
+    assert found.mean[0] == pytest.approx(0.5 * np.log(within), abs=1e-3)
+    assert found.sd[0] == pytest.approx((2 * count * (size - 1)) ** -0.5, rel=0.02)
+    # The prior of tau, log normal of .6, counts little against 1,200 cells.
+    assert found.mean[2] == pytest.approx(0.5 * np.log(between), abs=3e-3)
+    assert found.sd[2] == pytest.approx((2 * count) ** -0.5, rel=0.05)
+    assert np.exp(found.mean[1]) < 2 / residual.size
+
+
+def test_a_table_that_is_hardly_seen_tells_nothing():
+    """The priors' own middles and widths."""
+    none = np.zeros((0, 9))
+    found = table_errors(_TableCells(none, none, none, none > 0), 0.001, SIGMA_MAX)
+    assert np.exp(found.mean[2]) == pytest.approx(0.001) and found.sd.min() > 0.5
+
+
+def test_it_is_the_posterior_given_an_empty_table(problem):
+    """On a fine grid, from the density itself."""
+    objects, number = sample_scene(jax.random.key(5), np.array([0.0, -np.inf]), problem.library, problem.table)
+    scene = rendered(objects, number, problem)
+    errors = TrueErrors(0.0015, 0.03, 0.0012, 1.0)
+    image = simulate_shared_image(np.random.default_rng(5), scene, errors, problem)
+    shared = shared_error_image(image, problem.amplitudes, SIGMA_MAX)
+    grid = noise_posterior(image, shared, scene, errors)
+    nodes = shared.nodes
+    for name, below, to in (("sigma", grid.below_sigma, np.log), ("p_outlier", grid.below_p, logit)):
+        at = to(np.asarray(getattr(nodes, name), float))[[0, 3]]
+        places = to(getattr(grid, name))
+        share = np.zeros(len(below))  # of the grid's points, from the probability below the middle of each
+        for k, b in enumerate(below):
+            share[k] = 2 * (b - share.sum())
+        mean = share @ places
+        sd = (at[1] - at[0]) / 2
+        assert abs(at.mean() - mean) < 0.2 * sd
+        assert sd == pytest.approx(np.sqrt(share @ (places - mean) ** 2), rel=0.05)
+
+
+def test_objects_hardly_move_it(problem):
+    """What stands on the table is left out: the truth is within three standard deviations."""
+    wrong = []
+    for k in range(6):
+        rng, key = np.random.default_rng(k), jax.random.key(k)
+        objects, number = sample_scene(key, np.array([-np.inf, 0.0, 0.0]), problem.library, problem.table)
+        errors = TrueErrors(0.0005 * (k + 1), 0.01 * (k + 1), 0.001, 1.0)
+        image = simulate_shared_image(rng, rendered(objects, number, problem), errors, problem)
+        shared = shared_error_image(image, problem.amplitudes, 0.01)
+        cells = _table_cells(image, np.asarray(image.depth) > 0, shared.spread, int(shared.block))
+        found = table_errors(cells, 0.001, 0.01)
+        true = np.array([np.log(errors.sigma), logit(errors.p_outlier), np.log(errors.table)])
+        wrong.append((true - found.mean) / found.sd)
+    assert np.abs(wrong).max() < 3
+    assert np.sqrt(np.square(wrong).mean()) < 1.4
+
+
+def test_where_nodes_are(problem):
+    """A pair of sigmas with a pair of outliers' shares, one standard deviation to either side, in this order."""
+    objects, number = sample_scene(jax.random.key(5), np.array([0.0, -np.inf]), problem.library, problem.table)
+    image = simulate_shared_image(
+        np.random.default_rng(5), rendered(objects, number, problem), TrueErrors(0.0015, 0.03, 0.0012, 1.0), problem
+    )
+    nodes = error_nodes(image, np.asarray(image.depth) > 0, np.ones(image.depth.shape, np.float32), 4, 0.001, 0.01)
+    assert nodes.log_weight.shape == (4, 9)
+    assert np.array_equal(np.argsort(nodes.sigma, kind="stable"), np.arange(4))
+    for axis, value in ((0, np.log(nodes.sigma)), (1, logit(nodes.p_outlier.astype(float)))):
+        middle = value.mean()
+        x = (value - middle) / value.std()
+        assert np.allclose(np.abs(x), 1, atol=1e-3), axis
+    assert nodes.table[1] ** 2 == pytest.approx(nodes.table[0] * nodes.table[2], rel=1e-4)
+    assert nodes.scale[1] == 1
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (1.0, -0.5), (-2.0, 1.5)])
+def test_noise_is_drawn_about_what_the_scene_moves_it_to(slopes):
+    """A log likelihood that is linear beside the table's moves the normal density by its slopes."""
+    pairs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
+    sd = np.array([0.01, 0.1])
+    middle = np.array([np.log(0.001), logit(0.02)])
+    at = middle + sd * pairs
+    weight = np.zeros((4, 3), np.float32)
+    nodes = ErrorNodes(
+        np.exp(at[:, 0]).astype(np.float32),
+        (1 / (1 + np.exp(-at[:, 1]))).astype(np.float32),
+        np.ones(1, np.float32),
+        np.ones(3, np.float32),
+        weight,
+    )
+    value = jnp.asarray(np.repeat((pairs @ slopes)[:, None], 3, 1)[None] + np.log(HERMITE[1]), jnp.float32)
+    draws = 4000
+    noise = sample_noise_at(jax.random.key(0), nodes, jnp.repeat(value, draws, 0))
+    drawn = np.stack([np.log(np.asarray(noise.sigma)), logit(np.asarray(noise.p_outlier, float))], 1)
+    standard = (drawn - middle) / sd
+    assert standard.mean(0) == pytest.approx(slopes, abs=4 / draws**0.5)
+    assert standard.std(0) == pytest.approx([1, 1], abs=0.04)
+    assert abs(np.corrcoef(standard.T)[0, 1]) < 0.06
