@@ -108,6 +108,17 @@ def test_what_is_no_mcap(tmp_path, content):
         read_frames(file)
 
 
+@pytest.mark.parametrize("name", ["bag_0.db3", "bag_0.db3.zstd", "bag_0.mcap"])
+def test_a_recording_of_sqlite_names_the_remedy_by_its_file_and_by_its_folder(tmp_path, name):
+    file = tmp_path / name
+    file.write_bytes(b"SQLite format 3\0" + bytes(84))
+    hint = r"sqlite3 \(ros2 bag convert makes one\)"
+    with pytest.raises(BagError, match=f"{name}: expected an MCAP file, it is of storage {hint}"):
+        read_frames(file)
+    with pytest.raises(BagError, match=f"{tmp_path}.*: expected an .*{hint}"):  # a folder without its metadata.yaml
+        read_frames(tmp_path)
+
+
 def test_missing_paths(tmp_path, bag):
     with pytest.raises(BagError, match="nothing: no such file or folder"):
         read_frames(tmp_path / "nothing")
