@@ -15,7 +15,6 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth, encode_compressed_depth
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import decode_depth, encode_depth, intrinsics_from_camera_info
-from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.io.bag_contents import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -26,7 +25,8 @@ from bayes3d_ros.io.bag_contents import (
     read_contents,
     stamp_ns,
 )
-from bayes3d_ros.io.bag_topics import COMPRESSED_DEPTH, choose_depth_topic, choose_info_topic, choose_pose_topic
+from bayes3d_ros.io.bag_topics import COMPRESSED_DEPTH, choose_depth_topic, choose_info_topic
+from bayes3d_ros.io.camera_poses import camera_poses
 from bayes3d_ros.io.mcap_files import BagDamage, BagError, RawMessage, Topic, raw_messages, topics
 
 __all__ = [
@@ -43,12 +43,11 @@ __all__ = [
 
 DEPTH_TOPIC, INFO_TOPIC, POSE_TOPIC = "/depth/image_rect", "/depth/camera_info", "/camera_pose"
 TABLE_FRAME = "table"
-_FARTHEST = 1e5  # metres from the table's origin that a camera may be
 
 
-def read_frames(bag: Path, depth_topic: str | None = None) -> "FrameReader":
+def read_frames(bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME) -> "FrameReader":
     """The depth frames of a bag: iterate over them; `len` is their number."""
-    return FrameReader(bag, depth_topic)
+    return FrameReader(bag, depth_topic, table_frame)
 
 
 class FrameReader:
@@ -57,25 +56,28 @@ class FrameReader:
     depth_topic: Image, or CompressedImage of image_transport's compressedDepth; chosen as bag_topics.py says.
     info_topic: `camera_info` beside the depth topic, or the only CameraInfo topic. A frame takes the CameraInfo of its
         stamp; else, of those of its size, the latest before it; else the first after it.
-    pose_topic: a PoseStamped topic named camera_pose (T_table_camera); of several, the one that shares most of its
-        namespace with the depth topic. A frame takes the pose of exactly its stamp; a topic that holds a single pose
-        means a camera that stands still, and every frame takes it. /tf is not read.
+    pose_told: where camera poses come from, or why there are none; a part of a line. A PoseStamped topic named
+        camera_pose (T_table_camera); of several, the one that shares most of its namespace with the depth topic. A
+        frame takes the pose of exactly its stamp; a topic that holds a single pose means a camera that stands still,
+        and every frame takes it. In a bag without such a topic, /tf and /tf_static: from `table_frame` to the image's
+        frame, interpolated at the image's stamp.
 
     Raises BagError if there is nothing to read. While iterating, a frame that cannot be read is left out, and after the
     last frame one BagDamage says what was lost.
     """
 
-    def __init__(self, bag: Path, depth_topic: str | None = None) -> None:
+    def __init__(self, bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME) -> None:
         self.bag = bag
         contents = read_contents(bag)
         self.depth_topic = choose_depth_topic(contents, depth_topic)
         self.info_topic = choose_info_topic(contents, self.depth_topic)
-        self.pose_topic = choose_pose_topic(contents, self.depth_topic)
         self._count = contents.count[self.depth_topic]
         self._infos = [(stamp_ns(info.header), info) for info in contents.decoded(self.info_topic)]
-        poses = contents.decoded(self.pose_topic or "")
-        self._poses = {stamp_ns(pose.header): self._matrix(pose.pose) for pose in poses}
-        self._static_pose = next(iter(self._poses.values())) if len(poses) == 1 else None
+        self._poses = camera_poses(contents, self.depth_topic, table_frame)
+
+    @property
+    def pose_told(self) -> str:
+        return self._poses.told
 
     def __len__(self) -> int:
         return self._count
@@ -109,8 +111,8 @@ class FrameReader:
             intrinsics = self._intrinsics(stamp, (width, height))
         except ValueError as error:
             raise ValueError(f"stamp {stamp}: {error}") from None
-        pose = self._static_pose if self._static_pose is not None else self._poses.get(stamp)
-        return DepthFrame(depth, intrinsics, stamp, image.header.frame_id, pose)
+        frame_id = image.header.frame_id
+        return DepthFrame(depth, intrinsics, stamp, frame_id, self._poses.at(stamp, frame_id))
 
     def _intrinsics(self, stamp: int, size: tuple[int, int]) -> Intrinsics:
         def closeness(pair: tuple[int, Any]) -> tuple[bool, bool, bool, int]:  # smallest is best
@@ -119,16 +121,6 @@ class FrameReader:
 
         info = min(self._infos, key=closeness)[1]
         return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, size)
-
-    def _matrix(self, pose: Any) -> Float[np.ndarray, "4 4"]:
-        p, q = pose.position, pose.orientation
-        position, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-        usable = (np.abs(position) < _FARTHEST).all() and (np.abs(quaternion) < 2).all()  # of NaN neither is true
-        if not usable or not 0.9 < np.linalg.norm(quaternion) < 1.1:
-            got = " ".join(f"{v:g}" for v in (*position, *quaternion))
-            expected = f"expected finite poses x y z qx qy qz qw within {_FARTHEST:g} m, with unit quaternions"
-            raise BagError(f"{self.bag}: {self.pose_topic}: {expected}, got {got}")
-        return pose_matrix(position, quaternion)
 
 
 class BagWriter:
