@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt16
 from bayes3d_ros.geometry.depth_image import DEPTH_ENCODINGS, BytesLike, decode_depth, encode_depth
 from bayes3d_ros.geometry.grey_png import decode_png, encode_png, png_size
 
+TRANSPORT = "compressedDepth"  # image_transport publishes on TOPIC/compressedDepth what it compresses of TOPIC
 CODECS = ("png", "rvl")
 MOST_PIXELS = 1 << 24  # no depth camera has as many; an image that declares more is not unpacked
 _HEADER = struct.Struct("<iff")
@@ -49,7 +50,7 @@ def quantisation(farthest: float = 10.0, knee: float = 100.0) -> Quantisation:
 
 def is_compressed_depth(text: str) -> bool:
     """Whether the `format` of a CompressedImage is one of compressedDepth, be it a known one or not."""
-    return "compressedDepth" in text or text in DEPTH_ENCODINGS
+    return TRANSPORT in text or text in DEPTH_ENCODINGS
 
 
 def parse_format(text: str) -> CompressedFormat:

@@ -2,12 +2,12 @@
 
 """Which topics of a bag frames are made of. All functions raise BagError where there is no such topic, or no one."""
 
-from bayes3d_ros.geometry.compressed_depth import is_compressed_depth
+from bayes3d_ros.geometry.compressed_depth import TRANSPORT, is_compressed_depth
 from bayes3d_ros.geometry.depth_image import DEPTH_ENCODINGS
 from bayes3d_ros.io.bag_contents import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE, TF, BagContents
 from bayes3d_ros.io.mcap_files import BagError
 
-COMPRESSED_DEPTH = "/compressedDepth"  # what image_transport adds to the name of a depth topic
+COMPRESSED_DEPTH = f"/{TRANSPORT}"  # at the end of a topic's name
 
 
 def choose_depth_topic(contents: BagContents, asked: str | None = None) -> str:
