@@ -19,10 +19,11 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class FirstImage(NamedTuple):
-    """Of the first image of a topic: `encoding` of an Image, or `format` of a CompressedImage, and `frame_id`."""
+    """Of a topic's first image: `encoding` of an Image, or `format` of a CompressedImage, and its header's fields."""
 
     encoding: str
     frame_id: str
+    stamp: int  # nanoseconds
 
 
 @dataclass
@@ -62,7 +63,7 @@ def read_contents(bag: Path) -> BagContents:
             if msgtype in (IMAGE, COMPRESSED_IMAGE) and topic not in found.types:
                 image = decode(bag, message)
                 encoding = image.encoding if msgtype == IMAGE else image.format
-                found.images[topic] = FirstImage(encoding, image.header.frame_id)
+                found.images[topic] = FirstImage(encoding, image.header.frame_id, stamp_ns(image.header))
             elif msgtype in (CAMERA_INFO, POSE, TF):
                 found.small.setdefault(topic, []).append(message)
             found.types[topic] = msgtype

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.geometry.transform_tree import TransformTree
-from bayes3d_ros.io.bag_contents import BagContents, stamp_ns
+from bayes3d_ros.io.bag_contents import BagContents, FirstImage, stamp_ns
 from bayes3d_ros.io.bag_topics import choose_pose_topic, choose_tf_topics
 from bayes3d_ros.io.mcap_files import BagError
 
@@ -33,7 +33,7 @@ def camera_poses(contents: BagContents, depth_topic: str, table_frame: str) -> C
         return TopicPoses(contents, pose_topic)
     tf_topics = choose_tf_topics(contents, depth_topic)
     if tf_topics:
-        return TfPoses(contents, tf_topics, table_frame, contents.images[depth_topic].frame_id)
+        return TfPoses(contents, tf_topics, table_frame, contents.images[depth_topic])
     return NoPoses()
 
 
@@ -70,7 +70,7 @@ class TfPoses:
     """Transforms of tf that lead from `table_frame` to the image's frame: interpolated at the image's stamp, never
     extrapolated. Transforms that are not finite or not rigid are left out, as tf2 does."""
 
-    def __init__(self, contents: BagContents, topics: list[str], table_frame: str, camera_frame: str) -> None:
+    def __init__(self, contents: BagContents, topics: list[str], table_frame: str, image: FirstImage) -> None:
         self._table_frame, self._tree, unusable = table_frame, TransformTree(), 0
         for topic in topics:
             static = topic.endswith("tf_static")
@@ -82,20 +82,22 @@ class TfPoses:
                     continue
                 parent, child = transform.header.frame_id, transform.child_frame_id
                 self._tree.add(parent, child, stamp_ns(transform.header), T, static)
-        names = " and ".join(topics)
-        if self._tree.connects(table_frame, camera_frame):
-            self.told = f"camera pose of {names}, {table_frame!r} <- {camera_frame!r}"
-        else:
-            self.told = (
-                f"no camera pose: {names}: expected transforms from {camera_frame!r}, the images' frame, to "
-                f"{table_frame!r} (--table-frame); the bag has the frames {', '.join(self._tree.frames) or 'none'}"
-            )
+        self.told = self._tell(" and ".join(topics), image)
         if unusable:
             self.told += f"; {unusable} transforms are not finite or not rigid"
 
     def at(self, stamp: int, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
         """The pose at a stamp."""
         return self._tree.lookup(self._table_frame, frame_id, stamp)
+
+    def _tell(self, topics: str, image: FirstImage) -> str:
+        table, camera = self._table_frame, image.frame_id
+        if not self._tree.connects(table, camera):
+            expected = f"expected transforms from {camera!r}, the images' frame, to {table!r} (--table-frame)"
+            has = ", ".join(self._tree.frames) or "none"
+            return f"no camera pose: {topics}: {expected}; the bag has the frames {has}"
+        late = "" if self.at(image.stamp, camera) is not None else ", which has none at the first image's stamp"
+        return f"camera pose of {topics}, {table!r} <- {camera!r}{late}"
 
 
 def _matrix(position: Any, orientation: Any) -> Float[np.ndarray, "4 4"]:

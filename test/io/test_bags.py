@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures.bag_messages import START, STORE, assert_same, frame, image, info, pose, write
+from fixtures.bag_messages import START, STORE, assert_same, frame, image, info, pose, transforms, write
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -265,12 +265,16 @@ def test_bundled_bags_are_small():
 
 
 @pytest.mark.filterwarnings("error")
-def test_damage_of_any_kind_is_one_line(tmp_path):
+@pytest.mark.parametrize("encoding", ["16UC1", "16UC1; compressedDepth", "32FC1; compressedDepth rvl"])
+@pytest.mark.parametrize("poses", ["topic", "tf"])
+def test_damage_of_any_kind_is_one_line(tmp_path, encoding, poses):
     """100 damaged copies of a recording: bytes of the file, or of messages whose record is whole."""
-    with BagWriter(tmp_path / "bag") as writer:
+    with BagWriter(tmp_path / "bag", encoding) as writer:
         for k in range(3):
             writer.write(frame(k))
-    (recorded,) = (tmp_path / "bag").glob("*.mcap")
+    if poses == "tf":
+        with_tf_for_poses(tmp_path / "bag", tmp_path / "tf")
+    (recorded,) = (tmp_path / ("bag" if poses == "topic" else "tf")).glob("*.mcap")
     whole, messages = recorded.read_bytes(), list(raw_messages(recorded))
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.mcap", 0
     for k in range(100):
@@ -283,6 +287,17 @@ def test_damage_of_any_kind_is_one_line(tmp_path):
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > 60
+
+
+def with_tf_for_poses(bag, other):
+    """A copy of a bag whose poses are transforms of tf."""
+    messages = [(m.topic, STORE.deserialize_cdr(m.data, m.msgtype)) for m in raw_messages(bag)]
+    moving = [
+        ("/tf", transforms(("table", "camera", m.pose.position.x, 1.0), stamp=START + k * 10**8 + 7))
+        for k, (topic, m) in enumerate(pair for pair in messages if pair[0] == "/camera_pose")
+    ]
+    write(other, *[pair for pair in messages if pair[0] != "/camera_pose"], *moving)
+    assert all(f.T_table_camera is not None for f in read_frames(other))
 
 
 def damaged_bytes(whole, rng):

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from fixtures.bag_messages import START, STORE, header, image, info, pose, write
+from fixtures.bag_messages import START, image, info, pose, transforms, write
 
 from bayes3d_ros.cli.lines import recording_line
 from bayes3d_ros.cli.main import main
@@ -13,18 +13,6 @@ from bayes3d_ros.io.bags import read_frames
 
 MS = 10**6
 DEPTH = "/cam/depth/image_rect"
-
-
-def transforms(*links, stamp=START):
-    """A TFMessage of (parent, child, x, w)."""
-    t = STORE.types
-    made = []
-    for parent, child, x, w in links:
-        place = t["geometry_msgs/msg/Transform"](
-            t["geometry_msgs/msg/Vector3"](x, 0.0, 0.0), t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, w)
-        )
-        made.append(t["geometry_msgs/msg/TransformStamped"](header(stamp, parent), child, place))
-    return t["tf2_msgs/msg/TFMessage"](made)
 
 
 def recorded(path, *others, stamps=(0, 5, 10)):
@@ -49,7 +37,10 @@ def test_moving_transforms_are_interpolated_and_not_extrapolated(tmp_path):
     static = ("/tf_static", transforms(("arm", "table", -1.0, 1.0)))
     reader = read_frames(recorded(tmp_path / "bag", static, *moving, stamps=(-1, 0, 5, 10, 11)))
     assert places(reader) == [None, 1, 1.5, 2, None]
-    assert reader.pose_told == "camera pose of /tf and /tf_static, 'table' <- 'camera'"
+    assert (
+        reader.pose_told
+        == "camera pose of /tf and /tf_static, 'table' <- 'camera', which has none at the first image's stamp"
+    )
 
 
 def test_a_pose_topic_comes_first(tmp_path):
