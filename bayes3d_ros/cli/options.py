@@ -30,6 +30,17 @@ def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
+def table_frame_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """--table-frame NAME."""
+    return click.option(
+        "--table-frame",
+        default="table",
+        show_default=True,
+        metavar="NAME",
+        help="Frame of the table in tf (z up, origin on the table), for bags without a camera_pose topic.",
+    )(command)
+
+
 def replace_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """--replace."""
     return click.option("--replace", is_flag=True, help="Replace a model of the same name; default: refuse.")(command)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
-from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from
+from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
@@ -27,8 +27,11 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
 @click.option("--particles", type=int, help="Scenes carried by the sampler.")
 @click.option("--max-objects", type=int, help="Most objects a scene may hold.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
+@table_frame_option
 @device_option
-def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[str, ...], **options: Any) -> None:
+def parse(
+    bag: Path, library: Path, out: Path, topic: str | None, table_frame: str, more: tuple[str, ...], **options: Any
+) -> None:
     """Parse every depth frame of BAG into a posterior over scenes."""
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.objects.store import load_library
@@ -36,7 +39,7 @@ def parse(bag: Path, library: Path, out: Path, topic: str | None, more: tuple[st
 
     settings = settings_from(ParserSettings, more, options)
     models = load_library(library)
-    frames = read_frames(bag, topic)
+    frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
     done, failed = _parse_frames(frames, models, settings, out)
     if failed and not done:

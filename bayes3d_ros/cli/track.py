@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from bayes3d_ros.cli.lines import camera_line, recording_line
-from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from
+from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 
 
@@ -22,9 +22,17 @@ from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 @click.option("--hypotheses", type=int, help="Camera poses scored for every frame; default 1024.")
 @click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the tracker.")
+@table_frame_option
 @device_option
 def track(
-    bag: Path, library: Path, out: Path, topic: str | None, world: Path | None, more: tuple[str, ...], **options: Any
+    bag: Path,
+    library: Path,
+    out: Path,
+    topic: str | None,
+    table_frame: str,
+    world: Path | None,
+    more: tuple[str, ...],
+    **options: Any,
 ) -> None:
     """Follow the camera of BAG around what its first frame shows, or around a known world."""
     from bayes3d_ros.io.bags import read_frames
@@ -41,7 +49,7 @@ def track(
 
     settings = settings_from(TrackerSettings, more, options)
     models = load_library(library)
-    frames = read_frames(bag, topic)
+    frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
     enable_cache()
     every_core()

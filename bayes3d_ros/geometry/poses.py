@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 
 def pose_matrix(
@@ -16,6 +16,21 @@ def pose_matrix(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return T
+
+
+def interpolate(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], share: float) -> Float[np.ndarray, "4 4"]:
+    """The pose at `share` of the way from a to b: linear in the position, slerp in the orientation, as tf2 does."""
+    T = np.eye(4)
+    T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]])))(share).as_matrix()
+    return T
+
+
+def inverse_pose(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The inverse of a rigid transform."""
+    back = np.eye(4)
+    back[:3, :3], back[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
+    return back
 
 
 def slide(

@@ -16,6 +16,10 @@ from mcap.exceptions import InvalidMagic
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+_SQLITE_MAGIC = b"SQLite format 3\0"
+_REMEDY = "ros2 bag convert makes one"
+_SQLITE = f"expected an MCAP file, it is of storage sqlite3 ({_REMEDY})"
+
 
 class BagError(Exception):
     """A bag that cannot be used; one line naming the file or topic and what was expected."""
@@ -76,6 +80,8 @@ def _files(bag: Path) -> list[Path]:
     if not bag.exists():
         raise BagError(f"{bag}: no such file or folder, expected a rosbag2 folder or an .mcap file")
     if not bag.is_dir():
+        if ".db3" in bag.suffixes:
+            raise BagError(f"{bag}: {_SQLITE}")
         return [bag]
     files = sorted(bag.glob("*.mcap"))
     metadata = bag / "metadata.yaml"
@@ -87,13 +93,15 @@ def _files(bag: Path) -> list[Path]:
         except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
             raise BagError(f"{metadata}: expected the metadata of a rosbag2 recording") from None
         if storage != "mcap":
-            raise BagError(f"{metadata}: expected storage_identifier mcap, got {storage} (ros2 bag convert makes one)")
+            raise BagError(f"{metadata}: expected storage_identifier mcap, got {storage} ({_REMEDY})")
         if mode.lower() not in ("", "none"):
             raise BagError(
                 f"{metadata}: expected no rosbag2 compression (MCAP's own is read), got compression_mode {mode}"
             )
     if not files:
-        raise BagError(f"{bag}: expected an .mcap file in this folder, found none")
+        other = next(iter(sorted(bag.glob("*.db3*"))), None)
+        found = "none" if other is None else f"{other.name}, storage sqlite3 ({_REMEDY})"
+        raise BagError(f"{bag}: expected an .mcap file in this folder, found {found}")
     for file in files:
         if not file.exists():
             raise BagError(f"{file}: expected this file, which {metadata.name} lists")
@@ -121,6 +129,9 @@ def _messages(file: Path) -> Iterator[RawMessage]:
             except InvalidMagic:
                 if count or channels:  # the magic at the end
                     raise _damage(file, count) from None
+                stream.seek(0)
+                if stream.read(len(_SQLITE_MAGIC)) == _SQLITE_MAGIC:
+                    raise BagError(f"{file}: {_SQLITE}") from None
                 raise BagError(f"{file}: expected an MCAP file, it does not begin like one") from None
             except Exception:  # whatever a decoder raises on damaged bytes: short reads, checksums, decompression
                 raise _damage(file, count) from None

@@ -26,7 +26,6 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
-from bayes3d_ros.ros.from_messages import frame_from_messages
 from bayes3d_ros.ros.parameters import (
     CAMERA_TRACKER_SETTINGS,
     DEPTH_INPUT_PARAMETERS,
@@ -145,7 +144,7 @@ class CameraTrackerNode(Node):
             self._parts.health.discard()
             return
         try:
-            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
+            frame = messages.frame()
             with self._working(session.follower, frame):
                 known, estimate = session.follower.step(self._known, frame)
         except (ValueError, TrackingError, ParseError) as error:

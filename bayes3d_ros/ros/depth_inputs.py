@@ -4,17 +4,20 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo
 
+from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose, CameraPoseSource
+from bayes3d_ros.ros.depth_transport import TRANSPORTS, DepthMessage, depth_topic, other_transport
 from bayes3d_ros.ros.diagnostics import InputView, TopicView
-from bayes3d_ros.ros.from_messages import stamp_to_ns
+from bayes3d_ros.ros.from_messages import frame_from_messages, stamp_to_ns
 from bayes3d_ros.ros.input_queue import InputQueue
-from bayes3d_ros.ros.input_topics import DEPTH_INPUT, INFO_INPUT
+from bayes3d_ros.ros.input_topics import INFO_INPUT
 from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 
@@ -23,12 +26,20 @@ _POLL = 0.02  # seconds between two looks at what waits, where something does
 
 
 class DepthMessages(NamedTuple):
-    """An image with all that is known of its camera; `arrived` in seconds of time.monotonic."""
+    """An image with all that is known of its camera; `arrived` in seconds of time.monotonic, `topic` the image's."""
 
-    image: Image
+    image: DepthMessage
     info: CameraInfo
     pose: CameraPose
     arrived: float
+    topic: str
+
+    def frame(self) -> DepthFrame:
+        """The frame that they are of. ValueError with one line that names the topic, the message and the field."""
+        try:
+            return frame_from_messages(self.image, self.info, self.pose.T_table_camera)
+        except ValueError as error:
+            raise ValueError(f"{self.topic}: {error}") from None
 
 
 class DepthInputs:
@@ -47,7 +58,7 @@ class DepthInputs:
         wants_pose: Callable[[], bool] = lambda: True,
     ) -> None:
         self._deliver, self._wants_pose = deliver, wants_pose
-        self._queue: InputQueue[Image, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
+        self._queue: InputQueue[DepthMessage, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
         self.received, self.delivered = 0, 0
         self._delivered_at: float | None = None
         self._depth_at: float | None = None
@@ -62,9 +73,9 @@ class DepthInputs:
         self._looking = node.create_timer(_LOOK, self._look, clock=steady)
         self._polling = node.create_timer(_POLL, self._poll, clock=steady)
         reliability = settings.qos_reliability
-        self._image_topic = AutoSubscription(
-            node, Image, DEPTH_INPUT, self._on_image, reliability=reliability, depth=10
-        )
+        self._transport = settings.depth_transport
+        kind, topic = TRANSPORTS[self._transport], depth_topic(node, self._transport)
+        self._image_topic = AutoSubscription(node, kind, topic, self._on_image, reliability=reliability, depth=10)
         self._info_topic = AutoSubscription(
             node, CameraInfo, INFO_INPUT, self._on_info, reliability=reliability, depth=10, latched=True
         )
@@ -88,8 +99,10 @@ class DepthInputs:
             age = None if heard is None else now - heard
             return TopicView(subscription.topic, subscription.publishers, age, subscription.problem)
 
+        image = topic(self._image_topic, self._depth_at)
+        remedy = "" if image.publishers else other_transport(self._node, self._transport)
         return InputView(
-            image=topic(self._image_topic, self._depth_at),
+            image=replace(image, remedy=remedy) if remedy else image,
             info=topic(self._info_topic, self._info_at),
             waiting=self.waiting,
             delivered_age=None if self._delivered_at is None else now - self._delivered_at,
@@ -132,7 +145,7 @@ class DepthInputs:
         self._queue.poses_changed()
         self._take()
 
-    def _on_image(self, image: Image, latched: bool) -> None:
+    def _on_image(self, image: DepthMessage, latched: bool) -> None:
         self._depth_at = time.monotonic()
         self.received += 1
         stamp_ns = stamp_to_ns(image.header.stamp)
@@ -145,7 +158,7 @@ class DepthInputs:
         self._queue.add_info(stamp_to_ns(info.header.stamp), info, self._info_at)
         self._take()
 
-    def _find_pose(self, stamp_ns: int, image: Image, last: bool) -> CameraPose | None:
+    def _find_pose(self, stamp_ns: int, image: DepthMessage, last: bool) -> CameraPose | None:
         if self._poses is None or not self._wants_pose():
             return NO_POSE
         return self._poses.find(stamp_ns, image.header.frame_id, last)
@@ -166,4 +179,5 @@ class DepthInputs:
             self._pose_used = complete.pose
             self._delivered_at = time.monotonic()
             self.delivered += 1
-            self._deliver(DepthMessages(complete.image, complete.info, complete.pose, complete.arrived))
+            topic = self._image_topic.topic
+            self._deliver(DepthMessages(complete.image, complete.info, complete.pose, complete.arrived, topic))

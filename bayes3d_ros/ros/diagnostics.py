@@ -25,12 +25,13 @@ _KINDS = 100  # kinds of lines that are remembered
 @dataclass(frozen=True)
 class TopicView:
     """What a node can see of an input: its resolved name, the nodes that publish it (one entry a publisher), seconds
-    since the last message (None: never), and why a publisher cannot be heard."""
+    since the last message (None: never), why a publisher cannot be heard, and what to do where there is none."""
 
     name: str
     publishers: tuple[str, ...] = ()
     age: float | None = None
     qos_problem: str = ""
+    remedy: str = "start it, or remap the topic"
 
     @property
     def live(self) -> bool:
@@ -67,7 +68,7 @@ def why_no_input(view: InputView) -> str:
             continue
         if not topic.publishers:
             past = "" if topic.age is None else " any more"
-            return f"no publisher on {topic.name}{past}; start it, or remap the topic"
+            return f"no publisher on {topic.name}{past}; {topic.remedy}"
         if topic.qos_problem:
             return topic.qos_problem
         if topic.age is None:

@@ -6,9 +6,10 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose
 from jaxtyping import Float
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
 from bayes3d_ros.geometry.poses import pose_matrix
@@ -25,20 +26,27 @@ def depth_from_image(image: Image) -> Float[np.ndarray, "height width"]:
     return decode_depth(image.data, image.width, image.height, image.step, image.encoding, bool(image.is_bigendian))
 
 
-def intrinsics_from_message(info: CameraInfo, image: Image) -> Intrinsics:
-    """The intrinsics of an image. ValueError with one line naming the field that is wrong."""
-    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (image.width, image.height))
+def depth_from_compressed(image: CompressedImage) -> Float[np.ndarray, "height width"]:
+    """Metres, NaN where there is no return. ValueError with one line naming the field that is wrong."""
+    return decode_compressed_depth(image.data, image.format)
+
+
+def intrinsics_from_message(info: CameraInfo, width: int, height: int) -> Intrinsics:
+    """The intrinsics of an image of this size. ValueError with one line naming the field that is wrong."""
+    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height))
 
 
 def frame_from_messages(
-    image: Image, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
+    image: Image | CompressedImage, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> DepthFrame:
     """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
     try:
-        depth = depth_from_image(image)  # first: an image of a wrong size must not be blamed on its CameraInfo
+        # First: an image of a wrong size must not be blamed on its CameraInfo.
+        depth = depth_from_compressed(image) if isinstance(image, CompressedImage) else depth_from_image(image)
     except ValueError as error:
-        raise ValueError(f"Image {error}") from None
-    intrinsics = intrinsics_from_message(info, image)
+        raise ValueError(f"{type(image).__name__} {error}") from None
+    height, width = depth.shape
+    intrinsics = intrinsics_from_message(info, width, height)
     return DepthFrame(depth, intrinsics, stamp_to_ns(image.header.stamp), image.header.frame_id, T_table_camera)
 
 

@@ -49,6 +49,7 @@ _SHARED = (
     Argument("camera_info", INPUTS["camera_info"], "CameraInfo topic of that image; with bag: its name in the bag"),
     Argument("camera_pose", INPUTS["camera_pose"], "PoseStamped of the camera in table_frame; likewise"),
     Argument("table_frame", "", "frame of the table: z up, origin on the table; empty: what params_file says"),
+    Argument("depth_transport", "", "raw or compressedDepth (image_transport); empty: what params_file says"),
     Argument("log_level", "info", "debug, info, warn or error"),
     Argument(
         "fastdds_profile",
@@ -86,7 +87,7 @@ def node_description(node: str, parameters: Iterable[Argument], rviz: bool = Fal
         *_SHARED,
         *(_RVIZ if rviz else ()),
     )
-    given = [p.name for p in parameters] + ["table_frame"]
+    given = [p.name for p in parameters] + ["table_frame", "depth_transport"]
 
     def start(context: LaunchContext) -> list[Any]:
         # All of it is worked out before anything is started: what fails here leaves no process behind.

@@ -42,7 +42,7 @@ from bayes3d_ros.ros.diagnostics import (
     where_images_are,
     why_no_input,
 )
-from bayes3d_ros.ros.from_messages import frame_from_messages, stamp_to_ns
+from bayes3d_ros.ros.from_messages import stamp_to_ns
 from bayes3d_ros.ros.parameters import (
     DEPTH_INPUT_PARAMETERS,
     OBJECT_LEARNER_SETTINGS,
@@ -223,7 +223,7 @@ class ObjectLearnerNode(Node):
             why = why_no_input(self._parts.inputs.view())
             raise Refusal(f"the newest image came {age:.1f} s ago" + (f": {why}" if why else ""))
         try:
-            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
+            frame = messages.frame()
         except ValueError as error:
             raise Refusal(str(error)) from None
         if frame.T_table_camera is None and messages.pose.problem:
@@ -290,7 +290,7 @@ class ObjectLearnerNode(Node):
         if self._newest is None or not view.delivering:
             return WARN, f"no image is complete: {where_images_are(view)}"
         try:
-            frame_from_messages(self._newest.image, self._newest.info)
+            self._newest.frame()
         except ValueError as error:
             return WARN, str(error)
         if self._newest.pose.T_table_camera is None:

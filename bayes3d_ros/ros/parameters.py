@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bayes3d_ros.learning.learn import LearningError, check_name
+from bayes3d_ros.ros.depth_transport import RAW, TRANSPORTS
 from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.settings import (
     RETIRED,
@@ -43,6 +44,12 @@ class DepthInputSettings:
         "auto",
         "reliability of the input subscriptions; auto is reliable until a best-effort publisher is met",
         choices=("auto", "reliable", "best_effort"),
+    )
+    depth_transport: str = setting(
+        RAW,
+        "how depth images come: raw, as Image on depth/image_rect; compressedDepth, as CompressedImage of "
+        "image_transport on depth/image_rect/compressedDepth",
+        choices=tuple(TRANSPORTS),
     )
     table_frame: str = setting("table", "frame of the table: z up, origin on the table")
     camera_pose: tuple[float, ...] = setting(
@@ -129,7 +136,7 @@ NODE_SETTINGS = {
 DEPTH_INPUT_PARAMETERS = frozenset(f.name for f in fields(DepthInputSettings))
 # Those of an active scene_parser that are taken when they are set; its other inputs wait for the next activation.
 INPUT_PARAMETERS = ("camera_pose", "pose_max_gap", "pose_tolerance")
-FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
+FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "depth_transport", "table_frame", "patience")
 
 
 class SettingsParameters:

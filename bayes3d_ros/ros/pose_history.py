@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
 
+from bayes3d_ros.geometry.poses import interpolate
 from bayes3d_ros.ros.input_queue import JUMP_NS
 
 Matrix = Float[np.ndarray, "4 4"]
@@ -120,11 +120,3 @@ class PoseHistory:
     def _keep_only(self, stamps: list[int]) -> None:
         self._poses = {s: self._poses[s] for s in stamps}
         self._stamps = stamps
-
-
-def interpolate(a: Matrix, b: Matrix, share: float) -> Matrix:
-    """The pose at `share` of the way from a to b: linear in the position, slerp in the orientation, as tf2 does."""
-    T = np.eye(4)
-    T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
-    T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]])))(share).as_matrix()
-    return T

@@ -18,7 +18,6 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView
-from bayes3d_ros.ros.from_messages import frame_from_messages
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
@@ -211,7 +210,7 @@ class SceneParserNode(Node):
             health.discard()
             return
         try:
-            frame = frame_from_messages(messages.image, messages.info, messages.pose.T_table_camera)
+            frame = messages.frame()
             self._compile_for(frame, ready)
             with health.doing("parsing one frame", usual=QUIET):
                 posterior = ready.parser.parse(frame)

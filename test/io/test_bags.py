@@ -8,81 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures.bag_messages import START, STORE, assert_same, frame, image, info, pose, transforms, write
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.io.bags import BagDamage, BagError, BagWriter, raw_messages, read_frames, topics
 
-INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, 64, 48)
-START = 1_700_000_000 * 10**9
-STORE = get_typestore(Stores.ROS2_JAZZY)
 BUNDLED = Path(__file__).parents[2] / "bags"
-
-
-def frame(index=0, intrinsics=INTRINSICS, pose=True):
-    rng = np.random.default_rng(index)
-    depth = rng.integers(300, 2000, (intrinsics.height, intrinsics.width)).astype(np.float32) * np.float32(1e-3)
-    depth[rng.random(depth.shape) < 0.1] = np.nan
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
-    T[:3, 3] = rng.normal(size=3)
-    return DepthFrame(depth, intrinsics, START + index * 10**8 + 7, "camera", T if pose else None)
-
-
-def assert_same(a, b):
-    np.testing.assert_array_equal(a.depth, b.depth)
-    assert (a.intrinsics, a.stamp_ns, a.frame_id) == (b.intrinsics, b.stamp_ns, b.frame_id)
-    if b.T_table_camera is None:
-        assert a.T_table_camera is None
-    else:
-        np.testing.assert_allclose(a.T_table_camera, b.T_table_camera, atol=1e-12)
-
-
-def header(stamp=START, frame_id="camera"):
-    t = STORE.types
-    return t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id)
-
-
-def image(stamp=START, encoding="16UC1", width=64, height=48, step=None, data=None):
-    data = encode_depth(frame().depth) if data is None else data
-    step = len(data) // height if step is None else step
-    return STORE.types["sensor_msgs/msg/Image"](
-        header(stamp), height, width, encoding, 0, step, np.frombuffer(data, np.uint8)
-    )
-
-
-def info(stamp=START, fx=60.0, width=64, height=48):
-    k = np.array([fx, 0, 31.5, 0, fx, 23.5, 0, 0, 1.0])
-    roi = STORE.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    return STORE.types["sensor_msgs/msg/CameraInfo"](
-        header(stamp), height, width, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi
-    )
-
-
-def pose(stamp=START, x=1.0, w=1.0):
-    t = STORE.types
-    place = t["geometry_msgs/msg/Pose"](
-        t["geometry_msgs/msg/Point"](x, 0.0, 0.0), t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, w)
-    )
-    return t["geometry_msgs/msg/PoseStamped"](header(stamp, "table"), place)
-
-
-def write(path, *messages):
-    """A bag of (topic, message), recorded a millisecond apart."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {}
-        for i, (topic, message) in enumerate(messages):
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], START + i * 10**6, STORE.serialize_cdr(message, kind))
-    return path
 
 
 @pytest.fixture
@@ -173,6 +108,17 @@ def test_what_is_no_mcap(tmp_path, content):
         read_frames(file)
 
 
+@pytest.mark.parametrize("name", ["bag_0.db3", "bag_0.db3.zstd", "bag_0.mcap"])
+def test_a_recording_of_sqlite_names_the_remedy_by_its_file_and_by_its_folder(tmp_path, name):
+    file = tmp_path / name
+    file.write_bytes(b"SQLite format 3\0" + bytes(84))
+    hint = r"sqlite3 \(ros2 bag convert makes one\)"
+    with pytest.raises(BagError, match=f"{name}: expected an MCAP file, it is of storage {hint}"):
+        read_frames(file)
+    with pytest.raises(BagError, match=f"{tmp_path}.*: expected an .*{hint}"):  # a folder without its metadata.yaml
+        read_frames(tmp_path)
+
+
 def test_missing_paths(tmp_path, bag):
     with pytest.raises(BagError, match="nothing: no such file or folder"):
         read_frames(tmp_path / "nothing")
@@ -220,7 +166,8 @@ def test_missing_topics_name_those_there_are(tmp_path):
     assert "/color/image_raw (sensor_msgs/msg/Image rgb8), /camera_pose (geometry_msgs/msg/PoseStamped)" in str(
         error.value
     )
-    with pytest.raises(BagError, match="expected a topic /depth of type sensor_msgs/msg/Image; the bag has /color"):
+    expected = r"expected a topic /depth of type sensor_msgs/msg/Image, or .*CompressedImage.*; the bag has /color"
+    with pytest.raises(BagError, match=expected):
         read_frames(no_depth, "/depth")
     no_info = write(tmp_path / "b", ("/a/depth/image_rect", image()))
     with pytest.raises(BagError, match="expected sensor_msgs/msg/CameraInfo on /a/depth/camera_info"):
@@ -318,12 +265,16 @@ def test_bundled_bags_are_small():
 
 
 @pytest.mark.filterwarnings("error")
-def test_damage_of_any_kind_is_one_line(tmp_path):
+@pytest.mark.parametrize("encoding", ["16UC1", "16UC1; compressedDepth", "32FC1; compressedDepth rvl"])
+@pytest.mark.parametrize("poses", ["topic", "tf"])
+def test_damage_of_any_kind_is_one_line(tmp_path, encoding, poses):
     """100 damaged copies of a recording: bytes of the file, or of messages whose record is whole."""
-    with BagWriter(tmp_path / "bag") as writer:
+    with BagWriter(tmp_path / "bag", encoding) as writer:
         for k in range(3):
             writer.write(frame(k))
-    (recorded,) = (tmp_path / "bag").glob("*.mcap")
+    if poses == "tf":
+        with_tf_for_poses(tmp_path / "bag", tmp_path / "tf")
+    (recorded,) = (tmp_path / ("bag" if poses == "topic" else "tf")).glob("*.mcap")
     whole, messages = recorded.read_bytes(), list(raw_messages(recorded))
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.mcap", 0
     for k in range(100):
@@ -336,6 +287,17 @@ def test_damage_of_any_kind_is_one_line(tmp_path):
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > 60
+
+
+def with_tf_for_poses(bag, other):
+    """A copy of a bag whose poses are transforms of tf."""
+    messages = [(m.topic, STORE.deserialize_cdr(m.data, m.msgtype)) for m in raw_messages(bag)]
+    moving = [
+        ("/tf", transforms(("table", "camera", m.pose.position.x, 1.0), stamp=START + k * 10**8 + 7))
+        for k, (topic, m) in enumerate(pair for pair in messages if pair[0] == "/camera_pose")
+    ]
+    write(other, *[pair for pair in messages if pair[0] != "/camera_pose"], *moving)
+    assert all(f.T_table_camera is not None for f in read_frames(other))
 
 
 def damaged_bytes(whole, rng):

@@ -57,13 +57,19 @@ class Ros:
         self._processes.remove(process)
 
     def start_parser(
-        self, library: Path | str, *arguments: str, namespace: str = "/", **parameters: Any
+        self,
+        library: Path | str,
+        *arguments: str,
+        namespace: str = "/",
+        remapped: dict[str, str] | None = None,
+        **parameters: Any,
     ) -> NodeProcess:
         """Start scene_parser with a fake parser. `arguments` come before the ROS arguments. The tests of a process
         share a domain: where another node of this name runs, a namespace keeps them apart."""
         pairs = {"library": library, "patience": 0.2, **parameters}
         assignments = [word for name, value in pairs.items() for word in ("-p", f"{name}:={value}")]
-        ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", *assignments]
+        names = [word for name, other in (remapped or {}).items() for word in ("-r", f"{name}:={other}")]
+        ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", *names, *assignments]
         return self.start(str(HERE / "fake_scene_parser.py"), *arguments, *ros_arguments)
 
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> list:

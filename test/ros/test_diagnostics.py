@@ -41,6 +41,12 @@ def test_why_nothing_comes_in(seen: InputView, why: str) -> None:
     assert why_no_input(seen) == why
 
 
+def test_what_to_do_without_a_publisher_may_be_known() -> None:
+    image = TopicView(DEPTH, remedy=f"set depth_transport to compressedDepth: {DEPTH}/compressedDepth has a publisher")
+    expected = f"no publisher on {DEPTH}; set depth_transport to compressedDepth: {DEPTH}/compressedDepth has a publ"
+    assert why_no_input(InputView(image, TopicView(INFO))).startswith(expected)
+
+
 def test_it_is_ok_only_while_outputs_come(clock: list[float]) -> None:
     health = Health()
 

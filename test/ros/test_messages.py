@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Pose, Quaternion
-from sensor_msgs.msg import CameraInfo, Image, PointField
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointField
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
+from bayes3d_ros.geometry.compressed_depth import encode_compressed_depth
 from bayes3d_ros.geometry.depth_image import encode_depth
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples, UnexplainedPlace
@@ -49,6 +50,21 @@ def test_depth_survives_encoding_byte_order_and_padding(encoding: str, big: bool
     np.testing.assert_allclose(frame.depth, depth, atol=1e-6)
     assert frame.depth.dtype == np.float32
     assert (frame.stamp_ns, frame.frame_id) == (1_700_000_000_123_456_789, "camera")
+
+
+@pytest.mark.parametrize("codec", ["png", "rvl"])
+def test_compressed_depth_is_read(codec: str) -> None:
+    depth, header = depth_image(), Header(stamp=to_messages.ns_to_stamp(5), frame_id="camera")
+    text = f"16UC1; compressedDepth {codec}"
+    message = CompressedImage(header=header, format=text, data=array.array("B", encode_compressed_depth(depth, text)))
+    frame = from_messages.frame_from_messages(message, camera_info(8, 6))
+    np.testing.assert_array_equal(frame.depth, depth)
+    assert (frame.stamp_ns, frame.frame_id) == (5, "camera")
+    with pytest.raises(ValueError, match="CameraInfo width, height: expected the image's 8x6, got 4x3"):
+        from_messages.frame_from_messages(message, camera_info(4, 3))
+    message.format = "8UC1; compressedDepth"
+    with pytest.raises(ValueError, match="CompressedImage format: expected an encoding of 16UC1, mono16, 32FC1"):
+        from_messages.frame_from_messages(message, camera_info(8, 6))
 
 
 @pytest.mark.parametrize("ns", [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])

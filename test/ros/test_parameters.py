@@ -101,6 +101,7 @@ def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, Sett
         with_values("camera_pose:=[1.0, 2.0]"),
         with_values("camera_pose:=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]"),
         with_values("qos_reliability:=perhaps"),
+        with_values("depth_transport:=theora"),
         with_values("autostart:=3"),
         with_values("library:=5"),
     ],
