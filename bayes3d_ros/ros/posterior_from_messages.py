@@ -6,11 +6,18 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.posterior.summarise import number_of_unknown, object_estimates
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
-from bayes3d_ros.ros.from_messages import depth_from_image, labels_from_image, rows_from_cloud, stamp_to_ns
+from bayes3d_ros.ros.from_messages import (
+    depth_from_image,
+    labels_from_image,
+    rows_from_cloud,
+    stamp_to_ns,
+    transform_to_matrix,
+)
 from bayes3d_ros.ros.summary import UNEXPLAINED, place_from_words
 
 
@@ -51,10 +58,15 @@ def samples_from_rows(rows: np.ndarray) -> tuple[SceneSamples, np.ndarray]:
     return samples, index
 
 
+def _T_camera_table(messages: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    told = messages.get("T_camera_table")
+    return np.full((4, 4), np.nan) if told is None else transform_to_matrix(told.transform)
+
+
 def posterior_from_messages(messages: dict[str, Any], library: Library) -> ScenePosterior:
     """The posterior from one stamp's messages, by topic name without `~/`.
 
-    The table's pose is not published: T_camera_table is NaN.
+    Where `T_camera_table` is not among them, as in older recordings, T_camera_table is NaN.
     """
     cloud = messages["posterior"]
     samples, object_index = samples_from_rows(rows_from_cloud(cloud))
@@ -78,7 +90,7 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
         object_index=object_index,
         reconstruction=depth_from_image(messages["depth_reconstruction"]),
         segmentation=labels_from_image(messages["segmentation"]),
-        T_camera_table=np.full((4, 4), np.nan),
+        T_camera_table=_T_camera_table(messages),
         ess=tuple(float(e) for e in values["ess"].split()),
         seconds=float(values["ms"]) / 1e3,
         usable_share=float(values["usable share"]),

@@ -5,7 +5,7 @@
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, TransformStamped
 from rclpy.lifecycle import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
@@ -29,6 +29,7 @@ class ScenePublishers:
             return node.create_lifecycle_publisher(kind, f"~/{name}", qos)
 
         self._poses = publisher(PoseArray, "poses")
+        self._T_camera_table = publisher(TransformStamped, "T_camera_table")
         self._objects = publisher(MarkerArray, "objects")
         self._segmentation = publisher(Image, "segmentation")
         self._reconstruction = publisher(Image, "depth_reconstruction")
@@ -43,8 +44,9 @@ class ScenePublishers:
         """Publish the names of the types."""
         self._library.publish(to_messages.library_message(types))
 
-    def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers) -> None:
-        """Publish a scene on every topic."""
+    def scene(self, posterior: ScenePosterior, library: Library, markers: SceneMarkers, table_frame: str) -> None:
+        """Publish a scene on every topic. table_frame: the name of the table's frame."""
+        self._T_camera_table.publish(to_messages.table_transform(posterior, table_frame))
         self._poses.publish(to_messages.pose_array(posterior))
         self._segmentation.publish(to_messages.segmentation_image(posterior))
         self._reconstruction.publish(to_messages.reconstruction_image(posterior))

@@ -219,7 +219,8 @@ class SceneParserNode(Node):
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             self._parts.problem(str(error), why)
             return
-        self._outputs.scene(posterior, ready.parser.library, ready.markers)
+        table_frame = self._parts.settings.in_use(SceneParserNodeSettings).table_frame
+        self._outputs.scene(posterior, ready.parser.library, ready.markers, table_frame)
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 

@@ -13,6 +13,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from bayes3d_ros.geometry.depth_image import encode_depth
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples, UnexplainedPlace
 from bayes3d_ros.ros import detections, from_messages, to_messages
@@ -177,6 +178,13 @@ def test_poses_are_in_the_order_of_labels(library) -> None:
     assert len(poses.poses) == len(posterior.objects) == 2
     for pose, estimate in zip(poses.poses, posterior.objects, strict=True):
         np.testing.assert_allclose(from_messages.pose_to_matrix(pose)[:3, 3], estimate.position)
+
+
+def test_the_tables_transform_maps_table_coordinates_to_the_camera(library) -> None:
+    T_camera_table = np.linalg.inv(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    message = to_messages.table_transform(replace(scene(library.names), T_camera_table=T_camera_table), "table")
+    assert (message.header.frame_id, message.child_frame_id) == ("camera", "table")  # parent, child, as in tf
+    np.testing.assert_allclose(from_messages.transform_to_matrix(message.transform), T_camera_table, atol=1e-12)
 
 
 def test_markers_delete_the_old_ones_first_and_are_unique(library) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.posterior.summarise import posterior_rows
 from bayes3d_ros.posterior.types import UnexplainedPlace
 from bayes3d_ros.ros import to_messages
@@ -32,10 +33,12 @@ def test_samples_survive_rows(depth_frame, fake_posterior, library) -> None:
 def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library) -> None:
     posterior = fake_posterior(depth_frame(12_345), library.names)
     explained = tuple(replace(found, explained=0.25 * k) for k, found in enumerate(posterior.objects, start=1))
-    posterior = replace(posterior, objects=explained, unexplained=PLACES)
+    T_camera_table = np.linalg.inv(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    posterior = replace(posterior, objects=explained, unexplained=PLACES, T_camera_table=T_camera_table)
     messages = {
         "posterior": to_messages.posterior_cloud(posterior),
         "poses": to_messages.pose_array(posterior),
+        "T_camera_table": to_messages.table_transform(posterior, "table"),
         "summary": summary_message(posterior),
         "segmentation": to_messages.segmentation_image(posterior),
         "depth_reconstruction": to_messages.reconstruction_image(posterior),
@@ -47,6 +50,7 @@ def test_a_posterior_survives_its_messages(depth_frame, fake_posterior, library)
         np.testing.assert_allclose(mine.position, other.position, atol=1e-5)
         np.testing.assert_allclose(mine.probability, other.probability, atol=1e-5)
         np.testing.assert_allclose(mine.covariance, other.covariance, atol=1e-7)
+    np.testing.assert_allclose(again.T_camera_table, T_camera_table, atol=1e-12)
     np.testing.assert_array_equal(again.segmentation, posterior.segmentation)
     np.testing.assert_allclose(again.reconstruction, posterior.reconstruction)
     np.testing.assert_array_equal(again.object_index, posterior.object_index[:, : again.object_index.shape[1]])
