@@ -25,14 +25,19 @@ BAG = share_directory() / "bags" / "one_object"
 SIZE = (640, 480)
 SCENE_KEYS = {
     *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "num_unknown", "noise", "objects"),
-    *("T_camera_table", "ess", "usable_share", "unexplained", "notes"),
+    *("T_camera_table", "table_found", "ess", "usable_share", "unexplained", "notes"),
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
-    *("face_probabilities", "modes", "explained", "size", "size_sigma", "table_position"),
+    *("face_probabilities", "modes", "explained", "size", "size_sigma"),
+    *("table_position", "table_orientation", "table_covariance"),
 }
-MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
-FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma", "sx", "sy", "sz")
+MODE_KEYS = {
+    *("weight", "position", "orientation", "covariance", "contact_face"),
+    *("table_position", "table_orientation", "table_covariance"),
+}
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+FLOATS = (*POSE, "log_weight", "p_outlier", "sigma", "sx", "sy", "sz", *(f"table_{name}" for name in POSE))
 WHOLE = ("sample", "n", "object", "type", "face", "frame")
 BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "seconds"}
 

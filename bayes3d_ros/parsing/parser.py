@@ -88,6 +88,7 @@ class SceneParser:
         reconstruction, segmentation = self._reconstruct(frame, seen, scene)
         noise = float(samples.sigma[summary.reference]), settings.sigma_max
         explanation = explain(seen, reconstruction, segmentation, len(summary.objects), noise)
+        unknown_points, unknown_object = scene.unknown_returns(seen)
         shares = zip(summary.objects, explanation.explained, strict=True)
         full = settings.fixed_objects < 0 and len(summary.objects) >= settings.max_objects
         return ScenePosterior(
@@ -111,7 +112,9 @@ class SceneParser:
             full=full,
             usable_share=seen.usable_share,
             unexplained=explanation.unexplained,
-            **scene.unknown_returns(seen),
+            unknown_points=unknown_points,
+            unknown_object=unknown_object,
+            table_found=seen.found,
         )
 
     def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> tuple[Context, ImageModel]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayes3d_ros.objects.model import UNKNOWN, ObjectModel
+from bayes3d_ros.posterior.output_frame import OutputFrame
 
 # Of the pixels on the table. Three objects on a bundled table, pixels missing at random: all are found with 0.4 usable,
 # one is taken for another type with 0.36, one is missed with 0.33, and with 0.29 the table passes for empty, p 0.98.
@@ -17,7 +18,8 @@ FEWEST_USABLE = 0.4
 
 
 class SceneSamples(NamedTuple):
-    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres)."""
+    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres), or
+    of the frame that the posterior is told in (ScenePosterior.told_in)."""
 
     log_weight: Float[np.ndarray, "S"]  # normalised: exp sums to one
     num_objects: Int[np.ndarray, "S"]
@@ -92,7 +94,10 @@ class UnexplainedPlace(NamedTuple):
 
 @dataclass(frozen=True)
 class ScenePosterior:
-    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`."""
+    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`.
+
+    Poses of objects and samples are in the camera's optical frame, `frame_id`, or in `told_in` (posterior/reframe.py).
+    """
 
     stamp_ns: int
     frame_id: str
@@ -119,13 +124,25 @@ class ScenePosterior:
     # What returned from unknown things of the best scene: x y z in the camera, metres, and which of `objects`.
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
+    table_found: bool = False  # in the image alone: its frame is another one in every image, and no camera pose's
+    told_in: OutputFrame | None = None  # the frame of the poses; None: the camera's
+
+    @property
+    def pose_frame_id(self) -> str:
+        """The name of the frame that poses are in."""
+        return self.frame_id if self.told_in is None else self.told_in.name
+
+    @property
+    def T_pose_camera(self) -> Float[np.ndarray, "4 4"]:
+        """From the camera's frame to the one that poses are in."""
+        return np.eye(4) if self.told_in is None else self.told_in.T_frame_camera
 
     def table_position(self, found: ObjectEstimate) -> Float[np.ndarray, "3"]:
         """Where an object's origin is in the table's frame, metres; NaN where the table's pose is not known.
 
         Of an unknown thing this is the centre of its box's base. object_learner takes x and y as its at_x and at_y:
         with a camera pose the frame is the pose's, raised and tilted to the plane that the returns show."""
-        T = self.T_camera_table
+        T = self.T_pose_camera @ self.T_camera_table
         return np.asarray((found.position - T[:3, 3]) @ T[:3, :3], float)
 
     @property
