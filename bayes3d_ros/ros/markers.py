@@ -33,6 +33,7 @@ class SceneMarkers:
         pose, the lighter the fainter).
         """
         markers = [Marker(header=header(posterior), action=Marker.DELETEALL)]
+        above = -posterior.T_pose_camera[:3, 1]  # the camera's y points down
         for label, estimate in enumerate(posterior.objects, start=1):
             pose = pose_message(estimate.position, estimate.orientation)
             solid = self._solid(estimate, label)
@@ -40,8 +41,8 @@ class SceneMarkers:
             side = float(np.max(estimate.box(self._models)[1]))
 
             name = Marker(type=Marker.TEXT_VIEW_FACING, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
-            above = estimate.position - [0.0, 0.5 * side + _TEXT_HEIGHT, 0.0]  # y points down
-            name.pose = pose_message(above, np.array([0.0, 0.0, 0.0, 1.0]))
+            place = estimate.position + (0.5 * side + _TEXT_HEIGHT) * above
+            name.pose = pose_message(place, np.array([0.0, 0.0, 0.0, 1.0]))
             name.scale.z = _TEXT_HEIGHT
             name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
 

@@ -24,6 +24,7 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     level = DiagnosticStatus.WARN if posterior.warnings else DiagnosticStatus.OK
     scene = DiagnosticStatus(level=level, name="scene", hardware_id=posterior.frame_id, message=names)
     scene.values = key_values(
+        pose_frame=posterior.pose_frame_id,
         p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
         log_evidence=f"{posterior.log_evidence:.2f}",
         p_outlier=f"{posterior.p_outlier:.4f}",

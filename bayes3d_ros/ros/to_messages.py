@@ -54,8 +54,8 @@ def image_header(posterior: ScenePosterior) -> Header:
 
 
 def header(posterior: ScenePosterior) -> Header:
-    """The header of every other output: the image's stamp and frame."""
-    return image_header(posterior)
+    """The header of poses and all that holds some: the image's stamp, and the frame that they are told in."""
+    return Header(stamp=ns_to_stamp(posterior.stamp_ns), frame_id=posterior.pose_frame_id)
 
 
 def pose_array(posterior: ScenePosterior) -> PoseArray:
@@ -128,12 +128,13 @@ def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
 
 
 def unknown_cloud(posterior: ScenePosterior) -> PointCloud2:
-    """A point per return of an unknown thing of the best scene: x y z, and the object's index."""
+    """A point per return of an unknown thing of the best scene: x y z in the camera's frame, as images are, and the
+    object's index."""
     rows = np.zeros(len(posterior.unknown_points), _UNKNOWN_POINT)
     for k, name in enumerate(("x", "y", "z")):
         rows[name] = posterior.unknown_points[:, k]
     rows["object"] = posterior.unknown_object
-    return cloud_message(rows, header(posterior))
+    return cloud_message(rows, image_header(posterior))
 
 
 def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:
