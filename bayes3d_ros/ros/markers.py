@@ -3,6 +3,7 @@
 """A scene as RViz shows it: voxels, names and uncertainties of its objects."""
 
 import colorsys
+from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import Point, Vector3
@@ -25,10 +26,11 @@ class SceneMarkers:
         self._models = {model.name: model for model in library.models}
         self._voxels = {model.name: _voxel_points(model) for model in library.models}
 
-    def __call__(self, posterior: ScenePosterior) -> MarkerArray:
-        """Markers of one scene; the first one deletes all that were shown before. Ids are labels.
+    def __call__(self, posterior: ScenePosterior, ids: Sequence[str] = ()) -> MarkerArray:
+        """Markers of one scene; the first one deletes all that were shown before. Ids of markers are labels; `ids` are
+        the objects' own.
 
-        Namespaces: `voxels` (surface voxels), `unknown` (boxes of unknown things), `names` (type and p(exists)),
+        Namespaces: `voxels` (surface voxels), `unknown` (boxes of unknown things), `names` (id and p(exists)),
         `uncertainty` (ellipsoid of two standard deviations of the position), `modes` (voxels at the other modes of the
         pose, the lighter the fainter).
         """
@@ -44,7 +46,8 @@ class SceneMarkers:
             place = estimate.position + (0.5 * side + _TEXT_HEIGHT) * above
             name.pose = pose_message(place, np.array([0.0, 0.0, 0.0, 1.0]))
             name.scale.z = _TEXT_HEIGHT
-            name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
+            called = ids[label - 1] if ids else f"{label} {estimate.type}"
+            name.text = f"{called} {estimate.probability:.2f}"
 
             orientation, axes = principal_axes(estimate.covariance[:3, :3])
             spread = Marker(type=Marker.SPHERE, color=label_colour(label, 0.4))

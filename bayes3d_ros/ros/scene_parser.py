@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.object_ids import IdMemory, named
 from bayes3d_ros.posterior.reframe import in_frame
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
@@ -58,6 +59,7 @@ class SceneParserNode(Node):
         )
         self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
         self._frames: OutputFrames | None = None  # there while inputs are; likewise
+        self._ids = IdMemory()  # the worker's alone
         self._preparing_since: float | None = None
         self._requests = 0
         self._outputs = ScenePublishers(self)
@@ -237,7 +239,8 @@ class SceneParserNode(Node):
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             self._parts.problem(str(error), why)
             return
-        self._outputs.scene(told, ready.parser.library, ready.markers, frames.table_frame)
+        ids, self._ids = named(self._ids, told)
+        self._outputs.scene(told, ids, ready, frames.table_frame)
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 

@@ -2,6 +2,8 @@
 
 """A scene as people read it with `ros2 topic echo`: what stands where, how sure, and what the sampler did."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -17,8 +19,8 @@ def key_values(**values: str) -> list[KeyValue]:
     return [KeyValue(key=key.replace("_", " "), value=value) for key, value in values.items()]
 
 
-def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
-    """One status for the scene, then one per object, in the order of their labels."""
+def summary_message(posterior: ScenePosterior, ids: Sequence[str] = ()) -> DiagnosticArray:
+    """One status for the scene, then one per object, in the order of their labels, with its id if `ids` are given."""
     nothing = "no object of the library, but something unexplained" if posterior.unexplained else "no object"
     names = ", ".join(o.type for o in posterior.objects) or nothing
     level = DiagnosticStatus.WARN if posterior.warnings else DiagnosticStatus.OK
@@ -39,6 +41,8 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     scene.values += [KeyValue(key=UNEXPLAINED, value=place_words(place)) for place in posterior.unexplained]
     scene.values += [KeyValue(key="note", value=note) for note in posterior.notes]
     objects = [_object_status(k, o, posterior) for k, o in enumerate(posterior.objects, start=1)]
+    for status, name in zip(objects, ids, strict=False):
+        status.values.insert(0, KeyValue(key="id", value=name))
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])
 
 

@@ -268,7 +268,9 @@ def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> N
     samples = samples._replace(orientation=turned, type=kind)
     summary = summarise(samples, library.names, 0.5)
     posterior = replace(posterior, samples=samples, objects=summary.objects, object_index=summary.object_index)
-    first, second = detections.detection_array(posterior, library).detections
+    first, second = detections.detection_array(posterior, library, ("brick_3", "cube_1")).detections
+    assert (first.id, second.id) == ("brick_3", "cube_1")
+    assert [d.id for d in detections.detection_array(posterior, library).detections] == ["1", "2"]
     scores = [result.hypothesis.score for result in first.results]
     assert scores == sorted(scores, reverse=True)
     assert sum(scores) == pytest.approx(posterior.objects[0].probability)

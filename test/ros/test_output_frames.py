@@ -61,6 +61,9 @@ def test_poses_on_the_table_times_T_camera_table_are_those_in_the_camera(ros, li
         place = T_camera_table @ pose_to_matrix(other.pose)
         np.testing.assert_allclose(place[:3, 3], pose_to_matrix(mine.pose)[:3, 3], atol=1e-6)
     values = {pair.key: pair.value for pair in received["summary"][1].status[1].values}
+    assert values["id"] == "brick_2"  # a place in another frame is no place that it was seen at
+    names = [next(k.text for k in m.markers if k.ns == "names") for m in received["objects"]]
+    assert names == ["brick_1 0.75", "brick_2 0.75"]
     place = [float(v) for v in values["position m"].split()]
     assert values["position m"] == values["table position m"]
     np.testing.assert_allclose(place, pose_to_matrix(second.poses[0])[:3, 3], atol=1e-4)
