@@ -92,6 +92,9 @@ class SceneParserNodeSettings(DepthInputSettings):
         "camera's frame hold; on the table they move x, y and yaw alone",
         unit="m, rad",
     )
+    publish_tf: bool = setting(
+        False, "send the transform of every object to tf, from the frame of the poses to NODE/ID; needs tf2_ros"
+    )
     autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
     warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
     warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
@@ -146,7 +149,11 @@ NODE_SETTINGS = {
 DEPTH_INPUT_PARAMETERS = frozenset(f.name for f in fields(DepthInputSettings))
 # Those of an active scene_parser that are taken when they are set; its other inputs wait for the next activation.
 INPUT_PARAMETERS = ("camera_pose", "pose_max_gap", "pose_tolerance")
-OUTPUT_FRAME_PARAMETERS = ("output_frame", "camera_pose_sigma")  # likewise, and inputs stay open meanwhile
+OUTPUT_FRAME_PARAMETERS = (
+    "output_frame",
+    "camera_pose_sigma",
+    "publish_tf",
+)  # likewise, and inputs stay open meanwhile
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "table_frame", "patience")
 
 

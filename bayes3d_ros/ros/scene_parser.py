@@ -21,6 +21,7 @@ from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView
 from bayes3d_ros.ros.from_messages import frame_from_messages
+from bayes3d_ros.ros.object_transforms import ObjectTransforms
 from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
@@ -59,6 +60,7 @@ class SceneParserNode(Node):
         )
         self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
         self._frames: OutputFrames | None = None  # there while inputs are; likewise
+        self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
         self._ids = IdMemory()  # the worker's alone
         self._preparing_since: float | None = None
         self._requests = 0
@@ -200,12 +202,17 @@ class SceneParserNode(Node):
 
     def _open_frames(self) -> None:
         self._close_frames()
-        self._frames = OutputFrames(self, self._parts.settings.in_use(SceneParserNodeSettings))
+        settings = self._parts.settings.in_use(SceneParserNodeSettings)
+        self._frames = OutputFrames(self, settings)
+        self._transforms = ObjectTransforms(self) if settings.publish_tf else None
 
     def _close_frames(self) -> None:
         if self._frames is not None:
             self._frames.close()
             self._frames = None
+        if self._transforms is not None:
+            self._transforms.close()
+            self._transforms = None
 
     def _why_fixed(self, names: list[str]) -> str:
         fixed = [name for name in names if name in FIXED_WHILE_ACTIVE]
@@ -225,7 +232,8 @@ class SceneParserNode(Node):
 
     def _process(self, messages: DepthMessages) -> None:
         """On the worker's thread: one frame from messages to messages."""
-        ready, frames, health = self._ready, self._frames, self._parts.health
+        ready, health = self._ready, self._parts.health
+        frames, transforms = self._frames, self._transforms
         if ready is None or frames is None:
             health.discard()
             return
@@ -240,6 +248,8 @@ class SceneParserNode(Node):
             self._parts.problem(str(error), why)
             return
         ids, self._ids = named(self._ids, told)
+        if transforms is not None:  # before messages that name the ids
+            transforms.send(told, ids)
         self._outputs.scene(told, ids, ready, frames.table_frame)
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)

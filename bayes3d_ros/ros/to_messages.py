@@ -72,7 +72,14 @@ def table_transform(posterior: ScenePosterior, table_frame: str) -> TransformSta
 
 def transform_message(T: Float[np.ndarray, "4 4"], parent: Header, child: str) -> TransformStamped:
     """The transform that maps coordinates of frame `child` to the header's frame, as tf has it; metres."""
-    message, pose = TransformStamped(header=parent, child_frame_id=child), matrix_to_pose(T)
+    return pose_transform(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(), parent, child)
+
+
+def pose_transform(
+    position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"], parent: Header, child: str
+) -> TransformStamped:
+    """The same of a position in metres and a quaternion x y z w: where frame `child` is in the header's."""
+    message, pose = TransformStamped(header=parent, child_frame_id=child), pose_message(position, orientation)
     message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
     message.transform.rotation = pose.orientation
     return message
