@@ -30,6 +30,7 @@ SCENE_KEYS = {
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
     *("face_probabilities", "modes", "explained", "size", "size_sigma"),
+    *("mode_weight", "covariance_all", "modes_dropped", "weight_dropped"),
     *("table_position", "table_orientation", "table_covariance"),
 }
 MODE_KEYS = {
@@ -100,6 +101,8 @@ def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
         assert covariance.shape == (6, 6)
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
         assert np.linalg.eigvalsh(covariance).min() > -1e-12
+        assert found["covariance"] == found["modes"][0]["covariance"] and found["mode_weight"] == weights[0]
+        assert np.shape(found["covariance_all"]) == (6, 6) and found["modes_dropped"] >= 0 <= found["weight_dropped"]
 
 
 def test_samples_have_every_field(scenes: list[dict], samples: dict[str, np.ndarray]) -> None:

@@ -86,6 +86,7 @@ def _moved_object(found: ObjectEstimate, frame: OutputFrame) -> ObjectEstimate:
         position=position,
         orientation=orientation,
         covariance=_moved_covariance(found.covariance, position, frame),
+        covariance_all=_moved_covariance(found.covariance_all, position, frame),
         modes=tuple(_moved_mode(mode, frame) for mode in found.modes),
     )
 

@@ -46,9 +46,8 @@ class PoseMode(NamedTuple):
 class ObjectEstimate:
     """One object of the best scene, with what the other samples say of it.
 
-    All but the first three fields is given the most probable type. The pose is that of the heaviest mode: it is a
-    pose of the object, as a mean over several modes would not be. The covariance is the second moment of *all* poses
-    about it, so it is wide where there are other modes.
+    All but the first three fields is given the most probable type. Pose and covariance are the heaviest mode's: a
+    Gaussian of weight `mode_weight`, and a pose of the object, as a mean over several modes would not be.
     """
 
     type: str
@@ -56,7 +55,8 @@ class ObjectEstimate:
     probability: float  # that it exists
     position: Float[np.ndarray, "3"]  # T_camera_object
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
-    covariance: Float[np.ndarray, "6 6"]  # x y z, then delta in R = Exp(delta) R_mean, on the camera's axes
+    # Of the heaviest mode: x y z, then delta in R = Exp(delta) R_mean, on the axes of the frame that poses are in.
+    covariance: Float[np.ndarray, "6 6"]
     contact_face: int  # of the heaviest mode; -1 of an unknown thing
     modes: tuple[PoseMode, ...] = ()  # heaviest first; empty where they were not worked out
     face_probabilities: tuple[float, ...] = ()  # p(face 0) .. p(face 5); empty likewise
@@ -67,6 +67,19 @@ class ObjectEstimate:
     # their standard deviations, metres.
     size: Float[np.ndarray, "3"] | None = None
     size_sigma: Float[np.ndarray, "3"] | None = None
+    # The second moment of the poses of all modes, listed or not, about the pose; by default there is one mode.
+    covariance_all: Float[np.ndarray, "6 6"] = None  # type: ignore[assignment]
+    modes_dropped: int = 0  # how many modes are too light to be listed
+    weight_dropped: float = 0.0  # the share of the poses' weight that is in no listed mode
+
+    def __post_init__(self) -> None:
+        if self.covariance_all is None:
+            object.__setattr__(self, "covariance_all", self.covariance)
+
+    @property
+    def mode_weight(self) -> float:
+        """The weight of the mode that pose and covariance are of, of all listed modes."""
+        return self.modes[0].weight if self.modes else 1.0
 
     def box(self, models: Mapping[str, ObjectModel]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
         """T_object_box, at the box's centre, and the box's sides in metres: of the model, or of an unknown thing."""

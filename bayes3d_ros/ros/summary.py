@@ -70,6 +70,7 @@ def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosteri
         orientation_xyzw=spaced(estimate.orientation, 4),
         sigma_position_mm=sigma_position,
         sigma_rotation_deg=sigma_rotation,
+        mode_weight=f"{estimate.mode_weight:.3f}",
         contact_face=str(estimate.contact_face) if estimate.contact_face >= 0 else "",
         p_face=" ".join(f"{face}: {p:.3f}" for face, p in enumerate(estimate.face_probabilities) if p >= 5e-4),
         p_mode=" ".join(f"{k}: {mode.weight:.3f}" for k, mode in enumerate(estimate.modes, start=1)),
@@ -78,7 +79,12 @@ def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosteri
         status.values += key_values(
             size_m=spaced(estimate.size, 4), size_sigma_mm=spaced(np.asarray(estimate.size_sigma) * 1e3, 1)
         )
+    if estimate.modes_dropped:
+        told = f"{estimate.modes_dropped}, together p {estimate.weight_dropped:.4f}"
+        status.values.append(KeyValue(key="modes dropped", value=told))
     if len(estimate.modes) > 1:  # else it is what stands above
+        position_all, rotation_all = _sigmas(estimate.covariance_all)
+        status.values += key_values(sigma_position_all_mm=position_all, sigma_rotation_all_deg=rotation_all)
         status.values += [KeyValue(key=f"mode {k}", value=_mode(m)) for k, m in enumerate(estimate.modes, start=1)]
     return status
 

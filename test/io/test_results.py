@@ -21,8 +21,9 @@ KEYS = [
     "T_camera_table", "table_found", "ess", "usable_share", "unexplained", "notes",
 ]  # fmt: skip
 OBJECT_KEYS = [
-    "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes", "explained", "size", "size_sigma",
+    "type", "type_probabilities", "probability", "position", "orientation", "covariance", "mode_weight",
+    "covariance_all", "contact_face", "face_probabilities", "modes", "modes_dropped", "weight_dropped", "explained",
+    "size", "size_sigma",
     "table_position", "table_orientation", "table_covariance",
 ]  # fmt: skip
 MODE_KEYS = [

@@ -106,6 +106,7 @@ def test_what_is_told_is_what_the_moved_samples_say(posterior) -> None:
         np.testing.assert_allclose(mine.position, other.position, atol=1e-9)
         np.testing.assert_allclose(abs(mine.orientation @ other.orientation), 1, atol=1e-12)
         np.testing.assert_allclose(mine.covariance, other.covariance, atol=1e-12)
+        np.testing.assert_allclose(mine.covariance_all, other.covariance_all, atol=1e-12)
 
 
 def test_the_cameras_error_counts_once(posterior) -> None:

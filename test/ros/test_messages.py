@@ -242,7 +242,12 @@ def two_modes(names: tuple[str, ...]) -> ScenePosterior:
 def test_the_summary_and_the_markers_say_where_else_an_object_may_be(library) -> None:
     posterior = two_modes(library.names)
     values = {v.key: v.value for v in summary_message(posterior).status[1].values}
-    assert values["p mode"] == "1: 0.700 2: 0.300"
+    assert values["p mode"] == "1: 0.700 2: 0.300" and values["mode weight"] == "0.700"
+    wide = replace(posterior.objects[0], covariance_all=np.diag([0.132**2] * 6), modes_dropped=2, weight_dropped=0.012)
+    told = summary_message(replace(posterior, objects=(wide,))).status[1].values
+    told = {v.key: v.value for v in told}
+    assert told["sigma position mm"] == values["sigma position mm"]
+    assert told["sigma position all mm"] == "132.00 132.00 132.00" and told["modes dropped"] == "2, together p 0.0120"
     assert values["mode 2"].startswith("p 0.300, m -0.2") and "xyzw 0.0000 0.0000 1.0000 0.0000" in values["mode 2"]
     (other,) = [m for m in SceneMarkers(library)(posterior).markers if m.ns == "modes"]
     assert other.pose.orientation.z == 1.0 and other.color.a == pytest.approx(0.24)
