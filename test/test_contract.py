@@ -34,7 +34,7 @@ OBJECT_KEYS = {
     *("table_position", "table_orientation", "table_covariance"),
 }
 MODE_KEYS = {
-    *("weight", "position", "orientation", "covariance", "contact_face"),
+    *("weight", "weight_error", "position", "orientation", "covariance", "contact_face"),
     *("table_position", "table_orientation", "table_covariance"),
 }
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -93,6 +93,7 @@ def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
         assert all(set(mode) == MODE_KEYS and mode["contact_face"] in range(6) for mode in found["modes"])
         weights = [mode["weight"] for mode in found["modes"]]
         assert sum(weights) == pytest.approx(1) and weights == sorted(weights, reverse=True)
+        assert all(0 < mode["weight_error"] < 0.7 for mode in found["modes"])
         assert found["position"] == found["modes"][0]["position"]
         (thing,) = frame["objects"]
         np.testing.assert_allclose(found["position"], np.array(thing["T_camera_object"])[:3, 3], atol=0.01)

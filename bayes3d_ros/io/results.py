@@ -90,6 +90,7 @@ def _table_record(on_table: ObjectEstimate | PoseMode) -> dict[str, Any]:
 def _mode_record(mode: PoseMode, on_table: PoseMode) -> dict[str, Any]:
     return {
         "weight": json_number(mode.weight),
+        "weight_error": json_number(mode.weight_error),
         "position": json_numbers(mode.position),
         "orientation": json_numbers(mode.orientation),
         "covariance": json_numbers(mode.covariance),

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from bayes3d_ros.posterior.mode_weights import mode_weight_errors
 from bayes3d_ros.posterior.modes import medoid, mode_labels, nodes
 from bayes3d_ros.posterior.types import PoseMode
 
@@ -95,11 +96,12 @@ def pose_statistics(
     quaternion: Float[np.ndarray, "N 4"],
     weights: Float[np.ndarray, "N"],
     face: Int[np.ndarray, "N"],
+    draw: Int[np.ndarray, "N"] | None = None,
 ) -> PoseStatistics:
     """Modes of the poses (`modes.py` says what a mode is). Pose and covariance of the whole are the heaviest mode's, a
     Gaussian: a mean over several would be no pose of the object, and the spread of all poses about it (covariance_all)
-    comes and goes with light modes. Quaternions are x y z w; weights need not sum to one. The order of the poses does
-    not matter."""
+    comes and goes with light modes. Quaternions are x y z w; weights need not sum to one. draw: which independent draw
+    every pose descends from, for the errors of the modes' weights. The order of the poses does not matter."""
     order = np.lexsort([weights, *quaternion.T, *position.T])
     position, quaternion, weights, face = position[order], quaternion[order], weights[order], face[order]
     position, weights = position.astype(float), weights.astype(float) / weights.sum()
@@ -113,7 +115,11 @@ def pose_statistics(
         own = label == k
         found.append(pose_mode(position[own], quaternion[own], weights[own], face[own]))
     total = sum(mode.weight for mode in found)
-    modes = tuple(mode._replace(weight=mode.weight / total) for mode in found)
+    errors = np.full(len(found), np.nan) if draw is None else mode_weight_errors(label, weights, draw[order])
+    modes = tuple(
+        mode._replace(weight=mode.weight / total, weight_error=float(error))
+        for mode, error in zip(found, errors, strict=True)
+    )
     first = modes[0]
     spread = first.covariance
     if len(modes) > 1 or (label < 0).any():

@@ -281,6 +281,7 @@ def _pose(samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[n
     sample, slot = np.nonzero(member)
     heavy = weights[sample] > 1e-12 * weights[sample].max()
     place = sample[heavy], slot[heavy]
+    draw = None if samples.draw is None else samples.draw[place]
     return pose_statistics(
-        samples.position[place], samples.orientation[place], weights[place[0]], samples.face[place].clip(0)
+        samples.position[place], samples.orientation[place], weights[place[0]], samples.face[place].clip(0), draw
     )

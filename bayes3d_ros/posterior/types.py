@@ -30,6 +30,8 @@ class SceneSamples(NamedTuple):
     p_outlier: Float[np.ndarray, "S"]
     sigma: Float[np.ndarray, "S"]  # metres, a standard deviation
     size: Float[np.ndarray, "S M 3"] | None = None  # metres, of the boxes of unknown things; 0 of library types
+    # Which independent draw of the sampler an object descends from, by copies and small moves; None: not known.
+    draw: Int[np.ndarray, "S M"] | None = None
 
 
 class PoseMode(NamedTuple):
@@ -40,6 +42,7 @@ class PoseMode(NamedTuple):
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
     covariance: Float[np.ndarray, "6 6"]  # of this mode alone; as ObjectEstimate.covariance
     contact_face: int
+    weight_error: float = float("nan")  # Monte Carlo standard error of `weight`; NaN where draws are not known
 
 
 @dataclass(frozen=True)

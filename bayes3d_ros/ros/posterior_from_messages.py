@@ -80,6 +80,7 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     """The posterior in the camera's frame from one stamp's messages, by topic name without `~/`. Poses may have been
     told in the table's frame; ValueError where they are in yet another one.
 
+    Which draws samples descend from is not published: weights of modes have no Monte Carlo error.
     Where `T_camera_table` is not among them, as in older recordings, T_camera_table is NaN.
     """
     cloud, depth = messages["posterior"], messages["depth_reconstruction"]

@@ -79,6 +79,8 @@ def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosteri
         status.values += key_values(
             size_m=spaced(estimate.size, 4), size_sigma_mm=spaced(np.asarray(estimate.size_sigma) * 1e3, 1)
         )
+    if estimate.modes and np.isfinite(estimate.modes[0].weight_error):
+        status.values.append(KeyValue(key="mode weight sd", value=f"{estimate.modes[0].weight_error:.3f}"))
     if estimate.modes_dropped:
         told = f"{estimate.modes_dropped}, together p {estimate.weight_dropped:.4f}"
         status.values.append(KeyValue(key="modes dropped", value=told))
@@ -94,6 +96,7 @@ def _mode(mode: PoseMode) -> str:
     return (
         f"p {mode.weight:.3f}, m {spaced(mode.position, 4)}, xyzw {spaced(mode.orientation, 4)}, "
         f"sigma mm {sigma_position}, sigma deg {sigma_rotation}, face {mode.contact_face}"
+        + (f", p sd {mode.weight_error:.3f}" if np.isfinite(mode.weight_error) else "")
     )
 
 

@@ -27,7 +27,7 @@ OBJECT_KEYS = [
     "table_position", "table_orientation", "table_covariance",
 ]  # fmt: skip
 MODE_KEYS = [
-    "weight", "position", "orientation", "covariance", "contact_face",
+    "weight", "weight_error", "position", "orientation", "covariance", "contact_face",
     "table_position", "table_orientation", "table_covariance",
 ]  # fmt: skip
 
