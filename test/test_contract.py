@@ -25,14 +25,20 @@ BAG = share_directory() / "bags" / "one_object"
 SIZE = (640, 480)
 SCENE_KEYS = {
     *("stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "num_unknown", "noise", "objects"),
-    *("T_camera_table", "ess", "usable_share", "unexplained", "notes"),
+    *("T_camera_table", "table_found", "ess", "usable_share", "unexplained", "notes"),
 }
 OBJECT_KEYS = {
     *("type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face"),
-    *("face_probabilities", "modes", "explained", "size", "size_sigma", "table_position"),
+    *("face_probabilities", "modes", "explained", "size", "size_sigma"),
+    *("mode_weight", "covariance_all", "modes_dropped", "weight_dropped"),
+    *("table_position", "table_orientation", "table_covariance"),
 }
-MODE_KEYS = {"weight", "position", "orientation", "covariance", "contact_face"}
-FLOATS = ("x", "y", "z", "qx", "qy", "qz", "qw", "log_weight", "p_outlier", "sigma", "sx", "sy", "sz")
+MODE_KEYS = {
+    *("weight", "weight_error", "position", "orientation", "covariance", "contact_face"),
+    *("table_position", "table_orientation", "table_covariance"),
+}
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+FLOATS = (*POSE, "log_weight", "p_outlier", "sigma", "sx", "sy", "sz", *(f"table_{name}" for name in POSE))
 WHOLE = ("sample", "n", "object", "type", "face", "frame")
 BENCH_KEYS = {"what", "backend", "device", "size", "hypotheses", "per_second", "seconds"}
 
@@ -87,6 +93,7 @@ def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
         assert all(set(mode) == MODE_KEYS and mode["contact_face"] in range(6) for mode in found["modes"])
         weights = [mode["weight"] for mode in found["modes"]]
         assert sum(weights) == pytest.approx(1) and weights == sorted(weights, reverse=True)
+        assert all(0 < mode["weight_error"] < 0.7 for mode in found["modes"])
         assert found["position"] == found["modes"][0]["position"]
         (thing,) = frame["objects"]
         np.testing.assert_allclose(found["position"], np.array(thing["T_camera_object"])[:3, 3], atol=0.01)
@@ -95,6 +102,8 @@ def test_objects_are_in_the_camera_frame(scenes: list[dict]) -> None:
         assert covariance.shape == (6, 6)
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
         assert np.linalg.eigvalsh(covariance).min() > -1e-12
+        assert found["covariance"] == found["modes"][0]["covariance"] and found["mode_weight"] == weights[0]
+        assert np.shape(found["covariance_all"]) == (6, 6) and found["modes_dropped"] >= 0 <= found["weight_dropped"]
 
 
 def test_samples_have_every_field(scenes: list[dict], samples: dict[str, np.ndarray]) -> None:

@@ -13,6 +13,7 @@ from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
+    from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.objects.model import Library
     from bayes3d_ros.settings import ParserSettings
 
@@ -27,13 +28,30 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
 @click.option("--particles", type=int, help="Scenes carried by the sampler.")
 @click.option("--max-objects", type=int, help="Most objects a scene may hold.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
+@click.option(
+    "--camera-pose-sigma",
+    "sigma",
+    type=(click.FloatRange(0.0, 1.0), click.FloatRange(0.0, 1.0)),
+    default=(0.0, 0.0),
+    metavar="METRES RADIANS",
+    help="Standard deviations of recorded camera poses, for what is told in the table's frame.",
+)
 @table_frame_option
 @device_option
 def parse(
-    bag: Path, library: Path, out: Path, topic: str | None, table_frame: str, more: tuple[str, ...], **options: Any
+    bag: Path,
+    library: Path,
+    out: Path,
+    topic: str | None,
+    table_frame: str,
+    more: tuple[str, ...],
+    sigma: tuple[float, float],
+    **options: Any,
 ) -> None:
     """Parse every depth frame of BAG into a posterior over scenes."""
     from bayes3d_ros.io.bags import read_frames
+    from bayes3d_ros.io.results import ResultsWriter
+    from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.settings import ParserSettings
 
@@ -41,19 +59,20 @@ def parse(
     models = load_library(library)
     frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
-    done, failed = _parse_frames(frames, models, settings, out)
+    results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)
+    done, failed = _parse_frames(frames, models, settings, results)
     if failed and not done:
         raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
     parsed = f"{done} frame{'s' * (done != 1)} parsed" + (f", {failed} could not be" if failed else "")
     click.echo(f"{parsed}; results in {out}")
 
 
-def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSettings", out: Path) -> tuple[int, int]:
+def _parse_frames(
+    frames: "FrameReader", library: "Library", settings: "ParserSettings", writer: "ResultsWriter"
+) -> tuple[int, int]:
     """How many frames were parsed, and how many could not be."""
     from bayes3d_ros.io.plots import plot_scene
-    from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.jax_runtime import enable_cache
-    from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.parsing.parser import SceneParser
     from bayes3d_ros.posterior.types import ParseError
 
@@ -61,7 +80,7 @@ def _parse_frames(frames: "FrameReader", library: "Library", settings: "ParserSe
     parser = SceneParser(library, settings)
     failed = 0
     notes: tuple[str, ...] = ()
-    with ResultsWriter(out, type_names(library, settings.knows_unknown)) as results:
+    with writer as results:
         for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
             if not parser.compiled_for(camera.width, camera.height):

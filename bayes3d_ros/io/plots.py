@@ -243,9 +243,11 @@ def _words_panel(axis: Axes, posterior: ScenePosterior) -> None:
 
 
 def _spread_words(found: ObjectEstimate) -> str:
+    """Of the mode that is reported, with its weight where it is one of several."""
     place = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
     turn = np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:])))
-    return f"{_short(place)} mm  {_short(turn)}°"
+    weight = f"  p {found.mode_weight:.2f}" if len(found.modes) > 1 else ""
+    return f"{_short(place)} mm  {_short(turn)}°{weight}"
 
 
 def _short(value: float) -> str:

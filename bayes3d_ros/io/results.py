@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy.lib import format as npy
 
 from bayes3d_ros.files.atomic import write_whole
+from bayes3d_ros.posterior.reframe import in_frame, table_frame
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, UnexplainedPlace
 
@@ -25,9 +26,11 @@ class ResultsError(Exception):
     """A folder that results cannot be written to; one line naming it."""
 
 
-def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
-    """The line of scenes.jsonl, as JSON values. What is not a finite number is null."""
+def scene_record(posterior: ScenePosterior, camera_pose_sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Any]:
+    """The line of scenes.jsonl, as JSON values. What is not a finite number is null. The posterior is a parser's, in
+    the camera's frame; camera_pose_sigma (metres, radians) widens what is told in the table's frame."""
     height, width = posterior.segmentation.shape
+    on_table = in_frame(posterior, table_frame(posterior, camera_pose_sigma=camera_pose_sigma)).objects
     return {
         "stamp_ns": int(posterior.stamp_ns),
         "frame_id": posterior.frame_id,
@@ -37,8 +40,9 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
         "num_objects": {str(n): json_number(p) for n, p in posterior.num_objects.items()},
         "num_unknown": {str(n): json_number(p) for n, p in posterior.num_unknown.items()},
         "noise": {"p_outlier": json_number(posterior.p_outlier), "sigma": json_number(posterior.sigma)},
-        "objects": [_object_record(found, posterior.table_position(found)) for found in posterior.objects],
+        "objects": [_object_record(*both) for both in zip(posterior.objects, on_table, strict=True)],
         "T_camera_table": json_numbers(posterior.T_camera_table),
+        "table_found": posterior.table_found,
         "ess": json_numbers(posterior.ess),
         "usable_share": json_number(posterior.usable_share),
         "unexplained": [_place_record(place) for place in posterior.unexplained],
@@ -46,7 +50,8 @@ def scene_record(posterior: ScenePosterior) -> dict[str, Any]:
     }
 
 
-def _object_record(found: ObjectEstimate, table_position: Float[np.ndarray, "3"]) -> dict[str, Any]:
+def _object_record(found: ObjectEstimate, on_table: ObjectEstimate) -> dict[str, Any]:
+    """An object, in the camera's frame and in the table's."""
     return {
         "type": found.type,
         "type_probabilities": {name: json_number(p) for name, p in found.type_probabilities.items()},
@@ -54,13 +59,17 @@ def _object_record(found: ObjectEstimate, table_position: Float[np.ndarray, "3"]
         "position": json_numbers(found.position),
         "orientation": json_numbers(found.orientation),
         "covariance": json_numbers(found.covariance),
+        "mode_weight": json_number(found.mode_weight),
+        "covariance_all": json_numbers(found.covariance_all),
         "contact_face": _face(found.contact_face),
         "face_probabilities": json_numbers(found.face_probabilities),
-        "modes": [_mode_record(mode) for mode in found.modes],
+        "modes": [_mode_record(*both) for both in zip(found.modes, on_table.modes, strict=True)],
+        "modes_dropped": found.modes_dropped,
+        "weight_dropped": json_number(found.weight_dropped),
         "explained": json_number(found.explained),
         "size": None if found.size is None else json_numbers(found.size),
         "size_sigma": None if found.size_sigma is None else json_numbers(found.size_sigma),
-        "table_position": json_numbers(table_position),
+        **_table_record(on_table),
     }
 
 
@@ -69,13 +78,24 @@ def _face(face: int) -> int | None:
     return int(face) if face >= 0 else None
 
 
-def _mode_record(mode: PoseMode) -> dict[str, Any]:
+def _table_record(on_table: ObjectEstimate | PoseMode) -> dict[str, Any]:
+    """A pose in the table's frame."""
+    return {
+        "table_position": json_numbers(on_table.position),
+        "table_orientation": json_numbers(on_table.orientation),
+        "table_covariance": json_numbers(on_table.covariance),
+    }
+
+
+def _mode_record(mode: PoseMode, on_table: PoseMode) -> dict[str, Any]:
     return {
         "weight": json_number(mode.weight),
+        "weight_error": json_number(mode.weight_error),
         "position": json_numbers(mode.position),
         "orientation": json_numbers(mode.orientation),
         "covariance": json_numbers(mode.covariance),
         "contact_face": _face(mode.contact_face),
+        **_table_record(on_table),
     }
 
 
@@ -88,11 +108,12 @@ class ResultsWriter:
 
     Whatever ends the run, even a kill, scenes.jsonl holds whole lines of whole frames; samples.npz is written on
     leaving the context, from rows kept on disk until then. Results that an earlier run left in the folder are
-    replaced. The same posteriors give the same bytes, `seconds` aside.
+    replaced. The same posteriors give the same bytes, `seconds` aside. camera_pose_sigma: see scene_record.
     """
 
-    def __init__(self, folder: Path, types: Sequence[str]) -> None:
+    def __init__(self, folder: Path, types: Sequence[str], camera_pose_sigma: tuple[float, float] = (0.0, 0.0)) -> None:
         self.folder, self.types = Path(folder), tuple(types)
+        self._camera_pose_sigma = camera_pose_sigma
         self.frames = 0
         self._stamps: Counter[int] = Counter()
 
@@ -120,13 +141,9 @@ class ResultsWriter:
                 "segmentation": np.asarray(posterior.segmentation, np.uint16),
             }
             write_whole(path, lambda file: np.savez_compressed(file, **images))
-            rows = posterior_rows(posterior.samples, posterior.object_index)
-            framed = np.zeros(len(rows), _ROW)
-            for name, _ in POSTERIOR_FIELDS:
-                framed[name] = rows[name]
-            framed["frame"] = self.frames
-            self._rows.write(framed.tobytes())
-            self._scenes.write(json.dumps(scene_record(posterior), allow_nan=False) + "\n")
+            self._rows.write(sample_rows(posterior, self.frames).tobytes())
+            record = scene_record(posterior, self._camera_pose_sigma)
+            self._scenes.write(json.dumps(record, allow_nan=False) + "\n")
             self._scenes.flush()
         except OSError as error:  # a full disk; its error does not say where
             raise OSError(error.errno, error.strerror, str(self.folder)) from error
@@ -156,7 +173,21 @@ class ResultsWriter:
                     npy.write_array(entry, np.ascontiguousarray(column), allow_pickle=False)
 
 
-_ROW = np.dtype([*POSTERIOR_FIELDS, ("frame", np.int32)])
+_POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_ROW = np.dtype([*POSTERIOR_FIELDS, *((f"table_{name}", np.float32) for name in _POSE_FIELDS), ("frame", np.int32)])
+
+
+def sample_rows(posterior: ScenePosterior, frame: int) -> np.ndarray:
+    """The rows of samples.npz of one frame: those of the posterior, and every pose in the table's frame besides."""
+    rows = posterior_rows(posterior.samples, posterior.object_index)
+    on_table = posterior_rows(in_frame(posterior, table_frame(posterior)).samples, posterior.object_index)
+    framed = np.zeros(len(rows), _ROW)
+    for name, _ in POSTERIOR_FIELDS:
+        framed[name] = rows[name]
+    for name in _POSE_FIELDS:
+        framed[f"table_{name}"] = on_table[name]
+    framed["frame"] = frame
+    return framed
 
 
 def json_number(value: float) -> float | None:

@@ -63,11 +63,9 @@ class BestScene:
             np.where(nearer, shown, label).astype(np.uint16),
         )
 
-    def unknown_returns(self, seen: Observation) -> dict[str, np.ndarray]:
+    def unknown_returns(self, seen: Observation) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
         """Scored returns of the listed things: x y z in the camera, metres, and which object."""
         shown = self._shown(seen)
         where = shown > 0
-        return {
-            "unknown_points": unproject(seen.depth, seen.camera)[where].astype(np.float32),
-            "unknown_object": (shown[where] - 1).astype(np.int32),
-        }
+        points = unproject(seen.depth, seen.camera)[where].astype(np.float32)
+        return points, (shown[where] - 1).astype(np.int32)

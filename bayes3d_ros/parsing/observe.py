@@ -33,6 +33,7 @@ class Observation(NamedTuple):
     seen_table: SeenTable
     usable_share: float  # of the scored pixels on the table (`support_plane.py`)
     notes: list[str]  # on where the table comes from
+    found: bool = False  # whether the table was found in the image, and not given by a pose
 
     @property
     def T_camera_table(self) -> Float[np.ndarray, "4 4"]:
@@ -60,7 +61,7 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
     usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
     placed = table_of(T_camera_table, settings)
     notes = ["table found in the depth image"] if found else []
-    return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes)
+    return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes, found)
 
 
 def table_of(T_camera_table: Float[np.ndarray, "4 4"], settings: ParserSettings) -> Table:

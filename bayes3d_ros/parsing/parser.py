@@ -88,6 +88,7 @@ class SceneParser:
         reconstruction, segmentation = self._reconstruct(frame, seen, scene)
         noise = float(samples.sigma[summary.reference]), settings.sigma_max
         explanation = explain(seen, reconstruction, segmentation, len(summary.objects), noise)
+        unknown_points, unknown_object = scene.unknown_returns(seen)
         shares = zip(summary.objects, explanation.explained, strict=True)
         full = settings.fixed_objects < 0 and len(summary.objects) >= settings.max_objects
         return ScenePosterior(
@@ -111,7 +112,9 @@ class SceneParser:
             full=full,
             usable_share=seen.usable_share,
             unexplained=explanation.unexplained,
-            **scene.unknown_returns(seen),
+            unknown_points=unknown_points,
+            unknown_object=unknown_object,
+            table_found=seen.found,
         )
 
     def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> tuple[Context, ImageModel]:
@@ -191,12 +194,11 @@ class SceneParser:
             return Stage.without_scenes(float(state.log_evidence), state.objects.x.shape[1])
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
-        objects, gauss, log_weight, noise, log_evidence = jax.device_get(
-            (state.objects, gauss, state.log_weight, noise, state.log_evidence)
+        objects, gauss, log_weight, noise, log_evidence, lineage = jax.device_get(
+            (state.objects, gauss, state.log_weight, noise, state.log_evidence, state.lineage)
         )
-        stage = Stage(
-            objects, gauss, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), [()] * len(log_weight)
-        )
+        things: list[tuple[UnknownThing, ...]] = [()] * len(log_weight)
+        stage = Stage(objects, gauss, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), things, lineage)
         return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
 
     def _with_things(self, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation) -> Stage:

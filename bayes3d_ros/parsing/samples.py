@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.poses import slide
@@ -32,6 +32,7 @@ class Stage(NamedTuple):
     sigma: Float[np.ndarray, "N"]
     log_evidence: float
     things: list[tuple[UnknownThing, ...]]  # of each scene, what is of no type in the library
+    lineage: Int[np.ndarray, "N M"]  # which draw of its stage an object descends from
 
     @classmethod
     def without_scenes(cls, log_evidence: float, slots: int) -> "Stage":
@@ -39,7 +40,8 @@ class Stage(NamedTuple):
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        return cls(objects, np.zeros((0, slots + 1, 3), np.float32), zero, zero, zero, log_evidence, [])
+        gauss, lineage = np.zeros((0, slots + 1, 3), np.float32), np.zeros((0, slots), np.int32)
+        return cls(objects, gauss, zero, zero, zero, log_evidence, [], lineage)
 
 
 def mixture(
@@ -65,6 +67,7 @@ def mixture(
     # Each scene twice, with errors of either sign: means stay where they are.
     gauss = np.concatenate([s.gauss for s in stages])[keep]
     gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None, None]
+    lineage = _apart([s.lineage for s in stages])[keep]
     keep, table_error = np.repeat(keep, 2), gauss[:, 0] * seen.error_sd + seen.error
     objects = _beside_pictures(
         jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 1:], library, table, outline
@@ -93,8 +96,27 @@ def mixture(
         p_outlier=np.concatenate([s.p_outlier for s in stages])[keep],
         sigma=np.concatenate([s.sigma for s in stages])[keep],
         size=every.size.astype(np.float32),
+        draw=_draws(np.repeat(lineage, 2, 0), held, n[keep]),
     )
     return samples, float(log_evidence), things
+
+
+def _apart(lineages: Sequence[Int[np.ndarray, "_ M"]]) -> Int[np.ndarray, "N M"]:
+    """Lineages of all stages, so numbered that no two stages share one."""
+    first = np.cumsum([0, *(int(lineage.max(initial=0)) + 1 for lineage in lineages)])
+    return np.concatenate([lineage + start for lineage, start in zip(lineages, first, strict=False)])
+
+
+def _draws(
+    lineage: Int[np.ndarray, "S M0"], held: Bool[np.ndarray, "S M"], known: Int[np.ndarray, "S"]
+) -> Int[np.ndarray, "S M"]:
+    """The draw of every object: its lineage, of the first `known` ones; of a thing of no type its scene, of which there
+    are two samples each. -1 in empty slots."""
+    scene = int(lineage.max(initial=0)) + 1 + np.arange(len(held)) // 2
+    draw = np.repeat(scene[:, None], held.shape[1], 1)
+    own = np.arange(lineage.shape[1]) < known[:, None]
+    draw[:, : lineage.shape[1]][own] = lineage[own]
+    return np.where(held, draw, -1)
 
 
 def _beside_pictures(

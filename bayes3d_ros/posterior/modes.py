@@ -142,7 +142,8 @@ def mode_labels(
     weights: Float[np.ndarray, "N"],
     face: Int[np.ndarray, "N"],
 ) -> Int[np.ndarray, "N"]:
-    """The mode of every pose, 0 for the heaviest; -1 where it is left out.
+    """The mode of every pose, 0 for the heaviest; negative where it is left out: -1 where the pose itself counts for
+    next to nothing, -2, -3, ... where its mode does.
 
     Poses on different contact faces (they differ by 90 degrees or more) are in different modes. Poses that are in no
     mode of a share of NEGLIGIBLE_SHARE or more are gathered in one more mode where together they make up as much, else
@@ -161,12 +162,12 @@ def mode_labels(
             labels[own] = groups + np.unique(peaks(found), return_inverse=True)[1].ravel()[found.owner]
         groups = int(labels.max()) + 1
     share = np.bincount(labels + 1, weights, groups + 1)[1:] / weights.sum()
-    rest = np.isin(labels, np.flatnonzero(share < NEGLIGIBLE_SHARE))
+    light = np.flatnonzero(share < NEGLIGIBLE_SHARE)
+    rest = np.isin(labels, light)
     if weights[rest].sum() >= NEGLIGIBLE_SHARE * weights.sum():
         labels[rest] = groups
         share = np.append(np.where(share < NEGLIGIBLE_SHARE, 0.0, share), weights[rest].sum() / weights.sum())
-    else:
-        labels[rest] = -1
     rank = np.full(len(share) + 1, -1)
     rank[np.argsort(-share, kind="stable")] = np.arange(len(share))
+    rank[light] = -2 - np.arange(len(light))
     return rank[labels]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from bayes3d_ros.posterior.mode_weights import mode_weight_errors
 from bayes3d_ros.posterior.modes import medoid, mode_labels, nodes
 from bayes3d_ros.posterior.types import PoseMode
 
@@ -16,14 +17,19 @@ LOCAL_DISTANCE = 0.05  # ... and this, in metres, of its medoid
 
 
 class PoseStatistics(NamedTuple):
-    """position [3] and orientation [4] (quaternion x y z w, w >= 0) of the heaviest mode; covariance [6, 6]: the
-    second moment of all poses about that one (x y z, then delta in R = Exp(delta) R_mean, on the axes of the frame the
-    poses are given in; metres and radians); modes: heaviest first, weights sum to one."""
+    """position [3], orientation [4] (quaternion x y z w, w >= 0) and covariance [6, 6] of the heaviest mode;
+    covariance_all: the second moment of all poses about that mode's. Covariances are of x y z, then of delta in
+    R = Exp(delta) R_mean, on the axes of the frame the poses are given in; metres and radians. modes: heaviest first,
+    weights sum to one. modes_dropped: how many are too light to be among them; weight_dropped: the share of the weight
+    that is in none of them."""
 
     position: Float[np.ndarray, "3"]
     orientation: Float[np.ndarray, "4"]
     covariance: Float[np.ndarray, "6 6"]
+    covariance_all: Float[np.ndarray, "6 6"]
     modes: tuple[PoseMode, ...]
+    modes_dropped: int
+    weight_dropped: float
 
 
 def rotation_vectors(quaternion: Float[np.ndarray, "N 4"], origin: Float[np.ndarray, "4"]) -> Float[np.ndarray, "N 3"]:
@@ -90,11 +96,12 @@ def pose_statistics(
     quaternion: Float[np.ndarray, "N 4"],
     weights: Float[np.ndarray, "N"],
     face: Int[np.ndarray, "N"],
+    draw: Int[np.ndarray, "N"] | None = None,
 ) -> PoseStatistics:
-    """Modes of the poses (pose_modes.py says what a mode is). The pose of the whole is the heaviest mode's, since a
-    mean over several would be no pose of the object; its covariance is the spread of all poses about it, so that
-    whoever reads only these is told of the other modes. Quaternions are x y z w; weights need not sum to one. The order
-    of the poses does not matter."""
+    """Modes of the poses (`modes.py` says what a mode is). Pose and covariance of the whole are the heaviest mode's, a
+    Gaussian: a mean over several would be no pose of the object, and the spread of all poses about it (covariance_all)
+    comes and goes with light modes. Quaternions are x y z w; weights need not sum to one. draw: which independent draw
+    every pose descends from, for the errors of the modes' weights. The order of the poses does not matter."""
     order = np.lexsort([weights, *quaternion.T, *position.T])
     position, quaternion, weights, face = position[order], quaternion[order], weights[order], face[order]
     position, weights = position.astype(float), weights.astype(float) / weights.sum()
@@ -108,12 +115,17 @@ def pose_statistics(
         own = label == k
         found.append(pose_mode(position[own], quaternion[own], weights[own], face[own]))
     total = sum(mode.weight for mode in found)
-    modes = tuple(mode._replace(weight=mode.weight / total) for mode in found)
-    heaviest = modes[0]
-    covariance = heaviest.covariance
+    errors = np.full(len(found), np.nan) if draw is None else mode_weight_errors(label, weights, draw[order])
+    modes = tuple(
+        mode._replace(weight=mode.weight / total, weight_error=float(error))
+        for mode, error in zip(found, errors, strict=True)
+    )
+    first = modes[0]
+    spread = first.covariance
     if len(modes) > 1 or (label < 0).any():
-        covariance = second_moment(position, quaternion, weights, heaviest.position, heaviest.orientation)
-    return PoseStatistics(heaviest.position, heaviest.orientation, covariance, modes)
+        spread = second_moment(position, quaternion, weights, first.position, first.orientation)
+    dropped, weight_dropped = len(np.unique(label[label < -1])), float(weights[label < 0].sum())
+    return PoseStatistics(first.position, first.orientation, first.covariance, spread, modes, dropped, weight_dropped)
 
 
 def _near(

@@ -249,6 +249,9 @@ def _estimate(
         position=pose.position,
         orientation=pose.orientation,
         covariance=pose.covariance,
+        covariance_all=pose.covariance_all,
+        modes_dropped=pose.modes_dropped,
+        weight_dropped=pose.weight_dropped,
         contact_face=-1 if types[ranked[0]] == UNKNOWN else pose.modes[0].contact_face,
         modes=pose.modes,
         face_probabilities=() if types[ranked[0]] == UNKNOWN else tuple(float(p) for p in by_face / by_face.sum()),
@@ -278,6 +281,7 @@ def _pose(samples: SceneSamples, weights: Float[np.ndarray, "S"], member: Bool[n
     sample, slot = np.nonzero(member)
     heavy = weights[sample] > 1e-12 * weights[sample].max()
     place = sample[heavy], slot[heavy]
+    draw = None if samples.draw is None else samples.draw[place]
     return pose_statistics(
-        samples.position[place], samples.orientation[place], weights[place[0]], samples.face[place].clip(0)
+        samples.position[place], samples.orientation[place], weights[place[0]], samples.face[place].clip(0), draw
     )

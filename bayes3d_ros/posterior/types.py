@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayes3d_ros.objects.model import UNKNOWN, ObjectModel
+from bayes3d_ros.posterior.output_frame import OutputFrame
 
 # Of the pixels on the table. Three objects on a bundled table, pixels missing at random: all are found with 0.4 usable,
 # one is taken for another type with 0.36, one is missed with 0.33, and with 0.29 the table passes for empty, p 0.98.
@@ -17,7 +18,8 @@ FEWEST_USABLE = 0.4
 
 
 class SceneSamples(NamedTuple):
-    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres)."""
+    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres), or
+    of the frame that the posterior is told in (ScenePosterior.told_in)."""
 
     log_weight: Float[np.ndarray, "S"]  # normalised: exp sums to one
     num_objects: Int[np.ndarray, "S"]
@@ -28,6 +30,8 @@ class SceneSamples(NamedTuple):
     p_outlier: Float[np.ndarray, "S"]
     sigma: Float[np.ndarray, "S"]  # metres, a standard deviation
     size: Float[np.ndarray, "S M 3"] | None = None  # metres, of the boxes of unknown things; 0 of library types
+    # Which independent draw of the sampler an object descends from, by copies and small moves; None: not known.
+    draw: Int[np.ndarray, "S M"] | None = None
 
 
 class PoseMode(NamedTuple):
@@ -38,15 +42,15 @@ class PoseMode(NamedTuple):
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
     covariance: Float[np.ndarray, "6 6"]  # of this mode alone; as ObjectEstimate.covariance
     contact_face: int
+    weight_error: float = float("nan")  # Monte Carlo standard error of `weight`; NaN where draws are not known
 
 
 @dataclass(frozen=True)
 class ObjectEstimate:
     """One object of the best scene, with what the other samples say of it.
 
-    All but the first three fields is given the most probable type. The pose is that of the heaviest mode: it is a
-    pose of the object, as a mean over several modes would not be. The covariance is the second moment of *all* poses
-    about it, so it is wide where there are other modes.
+    All but the first three fields is given the most probable type. Pose and covariance are the heaviest mode's: a
+    Gaussian of weight `mode_weight`, and a pose of the object, as a mean over several modes would not be.
     """
 
     type: str
@@ -54,7 +58,8 @@ class ObjectEstimate:
     probability: float  # that it exists
     position: Float[np.ndarray, "3"]  # T_camera_object
     orientation: Float[np.ndarray, "4"]  # quaternion x y z w
-    covariance: Float[np.ndarray, "6 6"]  # x y z, then delta in R = Exp(delta) R_mean, on the camera's axes
+    # Of the heaviest mode: x y z, then delta in R = Exp(delta) R_mean, on the axes of the frame that poses are in.
+    covariance: Float[np.ndarray, "6 6"]
     contact_face: int  # of the heaviest mode; -1 of an unknown thing
     modes: tuple[PoseMode, ...] = ()  # heaviest first; empty where they were not worked out
     face_probabilities: tuple[float, ...] = ()  # p(face 0) .. p(face 5); empty likewise
@@ -65,6 +70,19 @@ class ObjectEstimate:
     # their standard deviations, metres.
     size: Float[np.ndarray, "3"] | None = None
     size_sigma: Float[np.ndarray, "3"] | None = None
+    # The second moment of the poses of all modes, listed or not, about the pose; by default there is one mode.
+    covariance_all: Float[np.ndarray, "6 6"] = None  # type: ignore[assignment]
+    modes_dropped: int = 0  # how many modes are too light to be listed
+    weight_dropped: float = 0.0  # the share of the poses' weight that is in no listed mode
+
+    def __post_init__(self) -> None:
+        if self.covariance_all is None:
+            object.__setattr__(self, "covariance_all", self.covariance)
+
+    @property
+    def mode_weight(self) -> float:
+        """The weight of the mode that pose and covariance are of, of all listed modes."""
+        return self.modes[0].weight if self.modes else 1.0
 
     def box(self, models: Mapping[str, ObjectModel]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
         """T_object_box, at the box's centre, and the box's sides in metres: of the model, or of an unknown thing."""
@@ -92,7 +110,10 @@ class UnexplainedPlace(NamedTuple):
 
 @dataclass(frozen=True)
 class ScenePosterior:
-    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`."""
+    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`.
+
+    Poses of objects and samples are in the camera's optical frame, `frame_id`, or in `told_in` (posterior/reframe.py).
+    """
 
     stamp_ns: int
     frame_id: str
@@ -119,13 +140,25 @@ class ScenePosterior:
     # What returned from unknown things of the best scene: x y z in the camera, metres, and which of `objects`.
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
+    table_found: bool = False  # in the image alone: its frame is another one in every image, and no camera pose's
+    told_in: OutputFrame | None = None  # the frame of the poses; None: the camera's
+
+    @property
+    def pose_frame_id(self) -> str:
+        """The name of the frame that poses are in."""
+        return self.frame_id if self.told_in is None else self.told_in.name
+
+    @property
+    def T_pose_camera(self) -> Float[np.ndarray, "4 4"]:
+        """From the camera's frame to the one that poses are in."""
+        return np.eye(4) if self.told_in is None else self.told_in.T_frame_camera
 
     def table_position(self, found: ObjectEstimate) -> Float[np.ndarray, "3"]:
         """Where an object's origin is in the table's frame, metres; NaN where the table's pose is not known.
 
         Of an unknown thing this is the centre of its box's base. object_learner takes x and y as its at_x and at_y:
         with a camera pose the frame is the pose's, raised and tilted to the plane that the returns show."""
-        T = self.T_camera_table
+        T = self.T_pose_camera @ self.T_camera_table
         return np.asarray((found.position - T[:3, 3]) @ T[:3, :3], float)
 
     @property

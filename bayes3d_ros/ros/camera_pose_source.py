@@ -2,32 +2,22 @@
 
 """Where the camera stands: from the camera_pose topic, from tf, or from parameters, in that order."""
 
-import math
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from jaxtyping import Float
-from rclpy.clock import JumpThreshold, TimeJump
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.time import Time
 
 from bayes3d_ros.ros.from_messages import matrix_from_values, pose_to_matrix, stamp_to_ns
 from bayes3d_ros.ros.input_topics import POSE_INPUT
 from bayes3d_ros.ros.parameters import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
+from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
 
-try:
-    import tf2_ros  # not on PyPI; comes with an installed ROS
-except ImportError:
-    tf2_ros = None
-
-_JUMP = 1.0  # seconds backwards, after which tf is heard anew; of real time, in which that is done once
-_TF_MEMORY = 10.0  # seconds: tf2 forgets, and refuses, what is this much older than the newest transform
 _HISTORY = 2.0  # seconds of poses that are kept beyond `patience`
 
 
@@ -78,7 +68,7 @@ class CameraPoseSource:
             depth=100,
             latched=True,
         )
-        self._tf = None if tf2_ros is None else _Tf(node, settings.table_frame)
+        self._tf: TfPoses | None = tf_poses(node, settings.table_frame)
 
     @property
     def topic(self) -> str:
@@ -180,96 +170,5 @@ class CameraPoseSource:
         if self._tf is not None and (in_use or (self._required and not reasons)):
             reasons.append(self._tf.why(stamp_ns, camera_frame))
         elif self._required and self._tf is None:
-            reasons.append("tf: tf2_ros is not installed")
+            reasons.append(NO_TF)
         return "; ".join(reasons)
-
-
-class _Tf:
-    """The camera's pose in tf. It is asked and never waited for."""
-
-    def __init__(self, node: Node, table_frame: str) -> None:
-        self._node, self._table_frame = node, table_frame
-        self._renew, self._renewed = False, -math.inf
-        self._connected: set[str] = set()  # camera frames that tf has connected with the table
-        self._failure = ""  # of the last lookup
-        backwards = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-_JUMP), on_clock_change=True)
-        self._clock_jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
-        self._listen()
-
-    def lookup(self, stamp_ns: int, camera_frame: str) -> Float[np.ndarray, "4 4"] | None:
-        """The pose at a stamp as tf2 knows it: exact, interpolated or static."""
-        return self._ask(_time(stamp_ns), camera_frame)[0]
-
-    def latest(self, stamp_ns: int, camera_frame: str, tolerance: float) -> Float[np.ndarray, "4 4"] | None:
-        """The newest pose, if its stamp is at most `tolerance` seconds from an image's."""
-        pose, newest = self._ask(Time(), camera_frame)
-        if pose is not None and abs(newest - stamp_ns) <= tolerance * 1e9:
-            return pose
-        self._ask(_time(stamp_ns), camera_frame)
-        if camera_frame in self._connected and "extrapolation into the future" not in self._failure:
-            self.renew(_TF_MEMORY)  # a transform of before a jump, or with a wrong stamp, keeps out what is older
-        return None
-
-    def connects(self, camera_frame: str) -> bool:
-        """Whether tf knows, or has known, how the camera and the table are connected."""
-        if camera_frame not in self._connected:
-            self._ask(Time(), camera_frame)
-        return camera_frame in self._connected
-
-    def why(self, stamp_ns: int, camera_frame: str) -> str:
-        """Why there is no pose: tf2's own words, and both frames."""
-        found, _ = self._ask(_time(stamp_ns), camera_frame)
-        told = self._failure if found is None else "it came too late"
-        return f"tf {self._table_frame!r} <- {camera_frame!r}: {told}"
-
-    def renew(self, apart: float = _JUMP) -> None:
-        """Hear tf anew at the next poll, and know no pose until then: what the buffer holds is of before a jump, and it
-        refuses what is older. (To clear it would lose /tf_static, which is sent only once to each listener.) Not within
-        `apart` seconds of the last time: the clock and the images tell of the same jump, and to begin twice would lose
-        what came meanwhile."""
-        self._renew |= time.monotonic() - self._renewed >= apart
-
-    def poll(self) -> None:
-        """To be called often: begins to hear tf anew, where that is asked for."""
-        if self._renew:
-            self._renew, self._renewed = False, time.monotonic()
-            self._listener.unregister()
-            self._listen()
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._clock_jumps.unregister()
-        self._listener.unregister()
-
-    def _on_clock_jump(self, jump: TimeJump) -> None:
-        self.renew()
-
-    def _listen(self) -> None:
-        self._buffer: Any = tf2_ros.Buffer()
-        self._listener: Any = tf2_ros.TransformListener(self._buffer, self._node, spin_thread=False)
-
-    def _ask(self, stamp: Time, camera_frame: str) -> tuple[Float[np.ndarray, "4 4"] | None, int]:
-        """The pose and its stamp in nanoseconds."""
-        if self._renew:
-            self._failure = "the clock, or the stamps of images, have just jumped back"
-            return None, 0
-        try:
-            found = self._buffer.lookup_transform(self._table_frame, camera_frame, stamp)
-        except tf2_ros.TransformException as error:
-            self._failure = " ".join(str(error).split())
-            if isinstance(error, tf2_ros.ExtrapolationException):
-                self._connected.add(camera_frame)
-            return None, 0
-        self._connected.add(camera_frame)
-        p, q = found.transform.translation, found.transform.rotation
-        try:
-            pose = matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
-        except ValueError as error:
-            self._failure = str(error)
-            return None, 0
-        return pose, stamp_to_ns(found.header.stamp)
-
-
-def _time(stamp_ns: int) -> Time:
-    """A stamp for tf2, to which 0 means the newest transform, whatever its age, and which knows no negative ones."""
-    return Time(nanoseconds=max(stamp_ns, 1))

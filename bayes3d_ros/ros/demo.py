@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, TransformStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
@@ -42,6 +42,7 @@ MESHES = (
     *("011_banana", "019_pitcher_base", "024_bowl", "025_mug", "035_power_drill"),
 )
 OUTPUTS: dict[str, type] = {
+    "T_camera_table": TransformStamped,
     "poses": PoseArray,
     "objects": MarkerArray,
     "segmentation": Image,

@@ -6,7 +6,6 @@ learns it where it stands, among others, and scene_parser calls it by its name."
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -141,13 +140,10 @@ class DemoTable:
 
     def parsed(self, k: int) -> Told:
         """What scene_parser made of frame k, once every output has come."""
-        frame = self.frames[k]
-        self._wait(lambda: not self._outputs.missing(frame.stamp_ns), f"the scene of frame {k + 1}", PARSE_SECONDS)
-        messages = self._outputs.by_stamp[frame.stamp_ns]
-        assert frame.T_table_camera is not None
+        stamp_ns = self.frames[k].stamp_ns
+        self._wait(lambda: not self._outputs.missing(stamp_ns), f"the scene of frame {k + 1}", PARSE_SECONDS)
+        messages = self._outputs.by_stamp[stamp_ns]
         posterior = posterior_from_messages(messages, load_library(self._library))
-        # The plane that was seen is not published; in pictures the pose's does as well.
-        posterior = replace(posterior, T_camera_table=np.linalg.inv(frame.T_table_camera))
         told = [{pair.key: pair.value for pair in status.values} for status in messages["summary"].status[1:]]
         return Told(posterior, tuple(np.array(values["table position m"].split(), float) for values in told))
 

@@ -4,7 +4,7 @@
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Pose, Transform
 from jaxtyping import Float
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
@@ -53,6 +53,12 @@ def frame_from_messages(
 def pose_to_matrix(pose: Pose) -> Float[np.ndarray, "4 4"]:
     """The transform of a pose. ValueError where it is not finite or its quaternion not of length one (within 1 %)."""
     p, q = pose.position, pose.orientation
+    return matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+
+
+def transform_to_matrix(transform: Transform) -> Float[np.ndarray, "4 4"]:
+    """The matrix of a transform. ValueError as pose_to_matrix."""
+    p, q = transform.translation, transform.rotation
     return matrix_from_values([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
 
 

@@ -3,6 +3,7 @@
 """A scene as RViz shows it: voxels, names and uncertainties of its objects."""
 
 import colorsys
+from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import Point, Vector3
@@ -25,14 +26,16 @@ class SceneMarkers:
         self._models = {model.name: model for model in library.models}
         self._voxels = {model.name: _voxel_points(model) for model in library.models}
 
-    def __call__(self, posterior: ScenePosterior) -> MarkerArray:
-        """Markers of one scene; the first one deletes all that were shown before. Ids are labels.
+    def __call__(self, posterior: ScenePosterior, ids: Sequence[str] = ()) -> MarkerArray:
+        """Markers of one scene; the first one deletes all that were shown before. Ids of markers are labels; `ids` are
+        the objects' own.
 
-        Namespaces: `voxels` (surface voxels), `unknown` (boxes of unknown things), `names` (type and p(exists)),
+        Namespaces: `voxels` (surface voxels), `unknown` (boxes of unknown things), `names` (id and p(exists)),
         `uncertainty` (ellipsoid of two standard deviations of the position), `modes` (voxels at the other modes of the
         pose, the lighter the fainter).
         """
         markers = [Marker(header=header(posterior), action=Marker.DELETEALL)]
+        above = -posterior.T_pose_camera[:3, 1]  # the camera's y points down
         for label, estimate in enumerate(posterior.objects, start=1):
             pose = pose_message(estimate.position, estimate.orientation)
             solid = self._solid(estimate, label)
@@ -40,10 +43,11 @@ class SceneMarkers:
             side = float(np.max(estimate.box(self._models)[1]))
 
             name = Marker(type=Marker.TEXT_VIEW_FACING, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
-            above = estimate.position - [0.0, 0.5 * side + _TEXT_HEIGHT, 0.0]  # y points down
-            name.pose = pose_message(above, np.array([0.0, 0.0, 0.0, 1.0]))
+            place = estimate.position + (0.5 * side + _TEXT_HEIGHT) * above
+            name.pose = pose_message(place, np.array([0.0, 0.0, 0.0, 1.0]))
             name.scale.z = _TEXT_HEIGHT
-            name.text = f"{label} {estimate.type} {estimate.probability:.2f}"
+            called = ids[label - 1] if ids else f"{label} {estimate.type}"
+            name.text = f"{called} {estimate.probability:.2f}"
 
             orientation, axes = principal_axes(estimate.covariance[:3, :3])
             spread = Marker(type=Marker.SPHERE, color=label_colour(label, 0.4))

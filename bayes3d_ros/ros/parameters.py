@@ -88,9 +88,29 @@ class SceneParserNodeSettings(DepthInputSettings):
     """What the scene_parser node needs beside the parser's own settings."""
 
     library: str = setting("", "folder of object models (bayes3d import); read on configure and on reload")
+    output_frame: str = setting(
+        "",
+        "frame of the poses that are published; empty: the camera's optical frame; table: the table's (table_frame); "
+        "or any frame that tf connects with the camera or the table. Images stay in the camera's frame",
+    )
+    camera_pose_sigma: tuple[float, ...] = setting(
+        (0.0, 0.0),
+        "standard deviations of the camera's pose along (m) and about (rad) each axis, which covariances outside the "
+        "camera's frame hold; on the table they move x, y and yaw alone",
+        unit="m, rad",
+    )
+    publish_tf: bool = setting(
+        False, "send the transform of every object to tf, from the frame of the poses to NODE/ID; needs tf2_ros"
+    )
     autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
     warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
     warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sigma = self.camera_pose_sigma
+        if len(sigma) != 2 or not all(0.0 <= value <= 1.0 for value in sigma):
+            raise ValueError(f"camera_pose_sigma must be two numbers in [0, 1], m and rad, got {list(sigma)}")
 
 
 @dataclass(frozen=True)
@@ -136,6 +156,11 @@ NODE_SETTINGS = {
 DEPTH_INPUT_PARAMETERS = frozenset(f.name for f in fields(DepthInputSettings))
 # Those of an active scene_parser that are taken when they are set; its other inputs wait for the next activation.
 INPUT_PARAMETERS = ("camera_pose", "pose_max_gap", "pose_tolerance")
+OUTPUT_FRAME_PARAMETERS = (
+    "output_frame",
+    "camera_pose_sigma",
+    "publish_tf",
+)  # likewise, and inputs stay open meanwhile
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "depth_transport", "table_frame", "patience")
 
 

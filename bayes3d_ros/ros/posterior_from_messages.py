@@ -6,11 +6,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from bayes3d_ros.objects.model import UNKNOWN, Library
+from bayes3d_ros.posterior.reframe import moved_samples
 from bayes3d_ros.posterior.summarise import number_of_unknown, object_estimates
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples
-from bayes3d_ros.ros.from_messages import depth_from_image, labels_from_image, rows_from_cloud, stamp_to_ns
+from bayes3d_ros.ros.from_messages import (
+    depth_from_image,
+    labels_from_image,
+    rows_from_cloud,
+    stamp_to_ns,
+    transform_to_matrix,
+)
 from bayes3d_ros.ros.summary import UNEXPLAINED, place_from_words
 
 
@@ -51,13 +59,33 @@ def samples_from_rows(rows: np.ndarray) -> tuple[SceneSamples, np.ndarray]:
     return samples, index
 
 
-def posterior_from_messages(messages: dict[str, Any], library: Library) -> ScenePosterior:
-    """The posterior from one stamp's messages, by topic name without `~/`.
+def _T_camera_table(messages: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    told = messages.get("T_camera_table")
+    return np.full((4, 4), np.nan) if told is None else transform_to_matrix(told.transform)
 
-    The table's pose is not published: T_camera_table is NaN.
+
+def _T_camera_pose(messages: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """From the frame that poses are told in to the camera's."""
+    camera, frame = (messages[name].header.frame_id for name in ("depth_reconstruction", "posterior"))
+    if frame == camera:
+        return np.eye(4)
+    if "T_camera_table" not in messages or frame != messages["T_camera_table"].child_frame_id:
+        raise ValueError(
+            f"posterior: expected poses in the frame of images, {camera!r}, or in the table's, got {frame!r}"
+        )
+    return _T_camera_table(messages)
+
+
+def posterior_from_messages(messages: dict[str, Any], library: Library) -> ScenePosterior:
+    """The posterior in the camera's frame from one stamp's messages, by topic name without `~/`. Poses may have been
+    told in the table's frame; ValueError where they are in yet another one.
+
+    Which draws samples descend from is not published: weights of modes have no Monte Carlo error.
+    Where `T_camera_table` is not among them, as in older recordings, T_camera_table is NaN.
     """
-    cloud = messages["posterior"]
+    cloud, depth = messages["posterior"], messages["depth_reconstruction"]
     samples, object_index = samples_from_rows(rows_from_cloud(cloud))
+    samples = moved_samples(samples, _T_camera_pose(messages))
     weights = np.exp(samples.log_weight.astype(float))
     scene, *told = messages["summary"].status
     values = {pair.key: pair.value for pair in scene.values}
@@ -66,7 +94,7 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     explained = [next(float(pair.value) for pair in status.values if pair.key == "explained") for status in told]
     return ScenePosterior(
         stamp_ns=stamp_of(cloud),
-        frame_id=cloud.header.frame_id,
+        frame_id=depth.header.frame_id,
         types=types,
         objects=tuple(replace(found, explained=share) for found, share in zip(objects, explained, strict=True)),
         num_objects={n: float(weights[samples.num_objects == n].sum()) for n in range(samples.num_objects.max() + 1)},
@@ -76,9 +104,9 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
         log_evidence=float(values["log evidence"]),
         samples=samples,
         object_index=object_index,
-        reconstruction=depth_from_image(messages["depth_reconstruction"]),
+        reconstruction=depth_from_image(depth),
         segmentation=labels_from_image(messages["segmentation"]),
-        T_camera_table=np.full((4, 4), np.nan),
+        T_camera_table=_T_camera_table(messages),
         ess=tuple(float(e) for e in values["ess"].split()),
         seconds=float(values["ms"]) / 1e3,
         usable_share=float(values["usable share"]),

@@ -13,14 +13,19 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.object_ids import IdMemory, named
+from bayes3d_ros.posterior.reframe import in_frame
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView
+from bayes3d_ros.ros.object_transforms import ObjectTransforms
+from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
+    OUTPUT_FRAME_PARAMETERS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
@@ -53,6 +58,9 @@ class SceneParserNode(Node):
             forbids=self._why_fixed,
         )
         self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
+        self._frames: OutputFrames | None = None  # there while inputs are; likewise
+        self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
+        self._ids = IdMemory()  # the worker's alone
         self._preparing_since: float | None = None
         self._requests = 0
         self._outputs = ScenePublishers(self)
@@ -182,12 +190,28 @@ class SceneParserNode(Node):
 
     def _open_inputs(self) -> None:
         use_pose = {"depth": "no", "auto": "yes", "pose": "required"}[self._parts.settings.read(ParserSettings).table]
+        self._open_frames()
         self._parts.listen(self._parts.worker.submit, use_pose)
         self._parts.health.begin()
 
     def _close_inputs(self) -> None:
         self._parts.close_inputs()
         self._parts.worker.forget()
+        self._close_frames()
+
+    def _open_frames(self) -> None:
+        self._close_frames()
+        settings = self._parts.settings.in_use(SceneParserNodeSettings)
+        self._frames = OutputFrames(self, settings)
+        self._transforms = ObjectTransforms(self) if settings.publish_tf else None
+
+    def _close_frames(self) -> None:
+        if self._frames is not None:
+            self._frames.close()
+            self._frames = None
+        if self._transforms is not None:
+            self._transforms.close()
+            self._transforms = None
 
     def _why_fixed(self, names: list[str]) -> str:
         fixed = [name for name in names if name in FIXED_WHILE_ACTIVE]
@@ -200,13 +224,16 @@ class SceneParserNode(Node):
         if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:
             self._close_inputs()
             self._open_inputs()
+        elif self._parts.inputs is not None and names & {*OUTPUT_FRAME_PARAMETERS}:
+            self._open_frames()
 
     # Frames
 
     def _process(self, messages: DepthMessages) -> None:
         """On the worker's thread: one frame from messages to messages."""
         ready, health = self._ready, self._parts.health
-        if ready is None or self._parts.inputs is None:
+        frames, transforms = self._frames, self._transforms
+        if ready is None or frames is None:
             health.discard()
             return
         try:
@@ -214,11 +241,15 @@ class SceneParserNode(Node):
             self._compile_for(frame, ready)
             with health.doing("parsing one frame", usual=QUIET):
                 posterior = ready.parser.parse(frame)
+            told = in_frame(posterior, frames.find(posterior, messages.pose, messages.arrived))
         except (ValueError, ParseError) as error:
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             self._parts.problem(str(error), why)
             return
-        self._outputs.scene(posterior, ready.parser.library, ready.markers)
+        ids, self._ids = named(self._ids, told)
+        if transforms is not None:  # before messages that name the ids
+            transforms.send(told, ids)
+        self._outputs.scene(told, ids, ready, frames.table_frame)
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 

@@ -2,6 +2,8 @@
 
 """A scene as people read it with `ros2 topic echo`: what stands where, how sure, and what the sampler did."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -17,13 +19,14 @@ def key_values(**values: str) -> list[KeyValue]:
     return [KeyValue(key=key.replace("_", " "), value=value) for key, value in values.items()]
 
 
-def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
-    """One status for the scene, then one per object, in the order of their labels."""
+def summary_message(posterior: ScenePosterior, ids: Sequence[str] = ()) -> DiagnosticArray:
+    """One status for the scene, then one per object, in the order of their labels, with its id if `ids` are given."""
     nothing = "no object of the library, but something unexplained" if posterior.unexplained else "no object"
     names = ", ".join(o.type for o in posterior.objects) or nothing
     level = DiagnosticStatus.WARN if posterior.warnings else DiagnosticStatus.OK
     scene = DiagnosticStatus(level=level, name="scene", hardware_id=posterior.frame_id, message=names)
     scene.values = key_values(
+        pose_frame=posterior.pose_frame_id,
         p_n=" ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items()),
         log_evidence=f"{posterior.log_evidence:.2f}",
         p_outlier=f"{posterior.p_outlier:.4f}",
@@ -38,6 +41,8 @@ def summary_message(posterior: ScenePosterior) -> DiagnosticArray:
     scene.values += [KeyValue(key=UNEXPLAINED, value=place_words(place)) for place in posterior.unexplained]
     scene.values += [KeyValue(key="note", value=note) for note in posterior.notes]
     objects = [_object_status(k, o, posterior) for k, o in enumerate(posterior.objects, start=1)]
+    for status, name in zip(objects, ids, strict=False):
+        status.values.insert(0, KeyValue(key="id", value=name))
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])
 
 
@@ -65,6 +70,7 @@ def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosteri
         orientation_xyzw=spaced(estimate.orientation, 4),
         sigma_position_mm=sigma_position,
         sigma_rotation_deg=sigma_rotation,
+        mode_weight=f"{estimate.mode_weight:.3f}",
         contact_face=str(estimate.contact_face) if estimate.contact_face >= 0 else "",
         p_face=" ".join(f"{face}: {p:.3f}" for face, p in enumerate(estimate.face_probabilities) if p >= 5e-4),
         p_mode=" ".join(f"{k}: {mode.weight:.3f}" for k, mode in enumerate(estimate.modes, start=1)),
@@ -73,7 +79,14 @@ def _object_status(label: int, estimate: ObjectEstimate, posterior: ScenePosteri
         status.values += key_values(
             size_m=spaced(estimate.size, 4), size_sigma_mm=spaced(np.asarray(estimate.size_sigma) * 1e3, 1)
         )
+    if estimate.modes and np.isfinite(estimate.modes[0].weight_error):
+        status.values.append(KeyValue(key="mode weight sd", value=f"{estimate.modes[0].weight_error:.3f}"))
+    if estimate.modes_dropped:
+        told = f"{estimate.modes_dropped}, together p {estimate.weight_dropped:.4f}"
+        status.values.append(KeyValue(key="modes dropped", value=told))
     if len(estimate.modes) > 1:  # else it is what stands above
+        position_all, rotation_all = _sigmas(estimate.covariance_all)
+        status.values += key_values(sigma_position_all_mm=position_all, sigma_rotation_all_deg=rotation_all)
         status.values += [KeyValue(key=f"mode {k}", value=_mode(m)) for k, m in enumerate(estimate.modes, start=1)]
     return status
 
@@ -83,6 +96,7 @@ def _mode(mode: PoseMode) -> str:
     return (
         f"p {mode.weight:.3f}, m {spaced(mode.position, 4)}, xyzw {spaced(mode.orientation, 4)}, "
         f"sigma mm {sigma_position}, sigma deg {sigma_rotation}, face {mode.contact_face}"
+        + (f", p sd {mode.weight_error:.3f}" if np.isfinite(mode.weight_error) else "")
     )
 
 

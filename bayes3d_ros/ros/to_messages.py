@@ -7,7 +7,16 @@ from collections.abc import Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseArray,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+    Vector3,
+)
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -39,15 +48,41 @@ def matrix_to_pose(T: Float[np.ndarray, "4 4"]) -> Pose:
     return pose_message(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat())
 
 
-def header(posterior: ScenePosterior) -> Header:
-    """The header of every output: the image's stamp and frame."""
+def image_header(posterior: ScenePosterior) -> Header:
+    """The header of images: their own stamp, and the camera's optical frame."""
     return Header(stamp=ns_to_stamp(posterior.stamp_ns), frame_id=posterior.frame_id)
+
+
+def header(posterior: ScenePosterior) -> Header:
+    """The header of poses and all that holds some: the image's stamp, and the frame that they are told in."""
+    return Header(stamp=ns_to_stamp(posterior.stamp_ns), frame_id=posterior.pose_frame_id)
 
 
 def pose_array(posterior: ScenePosterior) -> PoseArray:
     """The poses of the best scene; pose k is of the object labelled k + 1."""
     poses = [pose_message(o.position, o.orientation) for o in posterior.objects]
     return PoseArray(header=header(posterior), poses=poses)
+
+
+def table_transform(posterior: ScenePosterior, table_frame: str) -> TransformStamped:
+    """T_camera_table at the image's stamp: maps coordinates of the table's frame (z up, origin on the table), the
+    child, to the camera's optical frame, the header's."""
+    return transform_message(posterior.T_camera_table, image_header(posterior), table_frame)
+
+
+def transform_message(T: Float[np.ndarray, "4 4"], parent: Header, child: str) -> TransformStamped:
+    """The transform that maps coordinates of frame `child` to the header's frame, as tf has it; metres."""
+    return pose_transform(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(), parent, child)
+
+
+def pose_transform(
+    position: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"], parent: Header, child: str
+) -> TransformStamped:
+    """The same of a position in metres and a quaternion x y z w: where frame `child` is in the header's."""
+    message, pose = TransformStamped(header=parent, child_frame_id=child), pose_message(position, orientation)
+    message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+    message.transform.rotation = pose.orientation
+    return message
 
 
 def camera_pose_message(estimate: CameraEstimate, world_frame: str) -> PoseWithCovarianceStamped:
@@ -86,12 +121,12 @@ def image_message(pixels: np.ndarray, encoding: str, image_header: Header) -> Im
 
 def segmentation_image(posterior: ScenePosterior) -> Image:
     """16UC1: 0 none, k + 1 where object k is seen."""
-    return image_message(posterior.segmentation.astype(np.uint16), "16UC1", header(posterior))
+    return image_message(posterior.segmentation.astype(np.uint16), "16UC1", image_header(posterior))
 
 
 def reconstruction_image(posterior: ScenePosterior) -> Image:
     """32FC1: depth of the best scene in metres, NaN where there is no surface."""
-    return image_message(posterior.reconstruction.astype(np.float32), "32FC1", header(posterior))
+    return image_message(posterior.reconstruction.astype(np.float32), "32FC1", image_header(posterior))
 
 
 def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
@@ -100,12 +135,13 @@ def posterior_cloud(posterior: ScenePosterior) -> PointCloud2:
 
 
 def unknown_cloud(posterior: ScenePosterior) -> PointCloud2:
-    """A point per return of an unknown thing of the best scene: x y z, and the object's index."""
+    """A point per return of an unknown thing of the best scene: x y z in the camera's frame, as images are, and the
+    object's index."""
     rows = np.zeros(len(posterior.unknown_points), _UNKNOWN_POINT)
     for k, name in enumerate(("x", "y", "z")):
         rows[name] = posterior.unknown_points[:, k]
     rows["object"] = posterior.unknown_object
-    return cloud_message(rows, header(posterior))
+    return cloud_message(rows, image_header(posterior))
 
 
 def cloud_message(rows: np.ndarray, cloud_header: Header) -> PointCloud2:

@@ -105,6 +105,19 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
     assert last == f"3 frames parsed; results in {out}" and not result.stderr
 
 
+def test_errors_of_recorded_camera_poses_widen_what_is_told_on_the_table(bag, library, parsers, tmp_path):
+    told = []
+    for words in ((), ("--camera-pose-sigma", 0.01, 0.02)):
+        assert run("parse", bag, "--library", library, "--out", tmp_path / "out", *words).exit_code == 0
+        (first, *_) = (json.loads(text) for text in (tmp_path / "out" / "scenes.jsonl").read_text().splitlines())
+        told.append(first["objects"][0])
+    assert told[0]["covariance"] == told[1]["covariance"]
+    more = np.diag(np.subtract(told[1]["table_covariance"], told[0]["table_covariance"]))
+    assert more[0] >= 0.01**2 and more[5] == pytest.approx(0.02**2)
+    wrong = run("parse", bag, "--library", library, "--out", tmp_path / "o", "--camera-pose-sigma", -1, 0)
+    assert wrong.exit_code == 2 and "--camera-pose-sigma" in wrong.stderr
+
+
 def test_a_frame_without_objects_tells_how_sure_that_is(fake_posterior, depth_frame):
     line = frame_line(fake_posterior(depth_frame(), ("block",), objects=0))
     assert line == "1  0.25 s  no object p(n = 0) 1.00"

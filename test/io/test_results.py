@@ -10,18 +10,25 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.cli.lines import frame_line
-from bayes3d_ros.geometry.poses import look_at
-from bayes3d_ros.io.results import ResultsError, ResultsWriter, scene_record
+from bayes3d_ros.geometry.poses import look_at, pose_matrix
+from bayes3d_ros.io.results import ResultsError, ResultsWriter, sample_rows, scene_record
 from bayes3d_ros.posterior.summarise import posterior_rows
 
 TYPES = ("bowl", "can", "mug")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEYS = [
     "stamp_ns", "frame_id", "size", "seconds", "log_evidence", "num_objects", "num_unknown", "noise", "objects",
-    "T_camera_table", "ess", "usable_share", "unexplained", "notes",
+    "T_camera_table", "table_found", "ess", "usable_share", "unexplained", "notes",
 ]  # fmt: skip
 OBJECT_KEYS = [
-    "type", "type_probabilities", "probability", "position", "orientation", "covariance", "contact_face",
-    "face_probabilities", "modes", "explained", "size", "size_sigma", "table_position",
+    "type", "type_probabilities", "probability", "position", "orientation", "covariance", "mode_weight",
+    "covariance_all", "contact_face", "face_probabilities", "modes", "modes_dropped", "weight_dropped", "explained",
+    "size", "size_sigma",
+    "table_position", "table_orientation", "table_covariance",
+]  # fmt: skip
+MODE_KEYS = [
+    "weight", "weight_error", "position", "orientation", "covariance", "contact_face",
+    "table_position", "table_orientation", "table_covariance",
 ]  # fmt: skip
 
 
@@ -54,7 +61,7 @@ def test_a_line_a_frame(written):
             np.testing.assert_allclose(entry["position"], found.position, rtol=1e-9)
             assert sum(entry["face_probabilities"]) == pytest.approx(1.0)
             for mode, other in zip(entry["modes"], found.modes, strict=True):
-                assert list(mode) == ["weight", "position", "orientation", "covariance", "contact_face"]
+                assert list(mode) == MODE_KEYS
                 assert mode["weight"] == pytest.approx(other.weight)
                 np.testing.assert_allclose(mode["covariance"], other.covariance, rtol=1e-9)
 
@@ -80,9 +87,43 @@ def test_samples_are_the_posterior_rows_of_all_frames(written):
     assert samples["types"].tolist() == list(TYPES)
     expected = [posterior_rows(posterior.samples, posterior.object_index) for _, posterior in pairs]
     assert samples["frame"].tolist() == [k for k, rows in enumerate(expected) for _ in rows]
+    assert set(samples) == {*expected[0].dtype.names, *(f"table_{name}" for name in POSE), "frame", "types"}
     for name in expected[0].dtype.names:
         np.testing.assert_array_equal(samples[name], np.concatenate([rows[name] for rows in expected]))
         assert samples[name].dtype == expected[0].dtype[name]
+
+
+def test_poses_in_the_tables_frame_are_the_cameras_seen_from_the_table(depth_frame, fake_posterior):
+    """T_camera_table @ the table's pose is the camera's, of objects, of modes and of samples."""
+    T = np.linalg.inv(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    posterior = replace(fake_posterior(depth_frame(), TYPES, 3), T_camera_table=T)
+    record = scene_record(posterior)
+    axes = np.kron(np.eye(2), T[:3, :3])
+    for entry in (*record["objects"], *(mode for found in record["objects"] for mode in found["modes"])):
+        there = T @ pose_matrix(entry["table_position"], entry["table_orientation"])
+        np.testing.assert_allclose(there, pose_matrix(entry["position"], entry["orientation"]), atol=1e-6)
+        np.testing.assert_allclose(axes @ entry["table_covariance"] @ axes.T, entry["covariance"], atol=1e-12)
+    rows = sample_rows(posterior, 7)
+    np.testing.assert_array_equal(np.isnan(rows["table_x"]), rows["object"] < 0)
+    for row in rows[rows["object"] >= 0]:
+        camera, table = (np.array([row[f"{prefix}{name}"] for name in POSE], float) for prefix in ("", "table_"))
+        np.testing.assert_allclose(
+            T @ pose_matrix(table[:3], table[3:]), pose_matrix(camera[:3], camera[3:]), atol=1e-6
+        )
+    assert set(rows["frame"]) == {7}
+
+
+def test_the_cameras_error_widens_what_is_told_in_the_tables_frame_only(depth_frame, fake_posterior):
+    T = np.linalg.inv(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    posterior = replace(fake_posterior(depth_frame(), TYPES), T_camera_table=T)
+    sharp, wide = scene_record(posterior), scene_record(posterior, (0.003, 0.005))
+    found = scene_record(replace(posterior, table_found=True), (0.003, 0.005))
+    for a, b, c in zip(sharp["objects"], wide["objects"], found["objects"], strict=True):
+        assert a["covariance"] == b["covariance"] == c["covariance"]
+        more = np.diag(np.subtract(b["table_covariance"], a["table_covariance"]))
+        assert (more[[0, 1]] > 0.003**2).all() and more[5] == pytest.approx(0.005**2)
+        np.testing.assert_allclose(more[2:5], 0, atol=1e-12)
+        assert c["table_covariance"] == a["table_covariance"]  # no pose that might be off
 
 
 def test_frames_hold_the_images(written):

@@ -99,7 +99,7 @@ def test_one_peak_is_one_mode_with_the_samples_covariance(seed: int, spread: flo
     yaw = np.radians(np.random.default_rng(seed).normal(0, spread, 200))
     found = statistics(yaw, seed=seed)
     (mode,) = found.modes
-    np.testing.assert_array_equal(found.covariance, mode.covariance)
+    np.testing.assert_array_equal(found.covariance_all, mode.covariance)
     assert mode.covariance[5, 5] == pytest.approx(np.var(yaw), rel=0.02 if spread < 10 else 0.3)
     place = Rotation.from_quat(mode.orientation).apply(OFF_AXIS)
     np.testing.assert_allclose(mode.position, place, atol=0.002)  # of an object whose axis stands still
@@ -116,8 +116,8 @@ def test_two_peaks_half_a_turn_apart(seed: int) -> None:
         off = rotation_vectors(mode.orientation[None], Rotation.from_rotvec([0, 0, angle]).as_quat())[0]
         np.testing.assert_allclose(off, [0, 0, np.mean(yaw[own]) - angle], atol=1e-9)
         assert mode.covariance[5, 5] == pytest.approx(np.var(yaw[own]), rel=1e-6)
-    # Whoever reads only the estimate is not misled: the other peak is in its covariance.
-    assert found.covariance[5, 5] == pytest.approx(0.3 * np.pi**2, rel=0.05)
+    np.testing.assert_array_equal(found.covariance, found.modes[0].covariance)
+    assert found.covariance_all[5, 5] == pytest.approx(0.3 * np.pi**2, rel=0.05)  # the other peak is in it
 
 
 @pytest.mark.parametrize(("peaks", "apart"), [(2, 90), (4, 90), (6, 60), (2, 45)])
@@ -185,10 +185,35 @@ def test_what_is_negligible_is_left_out_of_the_modes_and_stays_in_the_covariance
     found = statistics(yaw)
     (mode,) = found.modes
     assert mode.weight == pytest.approx(1.0) and mode.covariance[5, 5] < 0.03**2
-    assert found.covariance[5, 5] == pytest.approx(np.pi**2 / 200, rel=0.05)
+    assert found.covariance_all[5, 5] == pytest.approx(np.pi**2 / 200, rel=0.05)
+    assert (found.modes_dropped, found.weight_dropped) == (1, pytest.approx(1 / 200))
     # Where together they are not negligible they are one more mode.
     scattered = np.append(np.random.default_rng(0).normal(0, 0.02, 190), np.linspace(0.8, 5.4, 10))
     assert [mode.weight for mode in statistics(scattered).modes] == pytest.approx([0.95, 0.05])
+
+
+@pytest.mark.parametrize("dropped", range(4))
+def test_modes_that_are_not_listed_are_counted(dropped: int) -> None:
+    """Single poses of .4 % each, far apart; with the lightest of all, which is no mode."""
+    yaw = np.append(np.random.default_rng(0).normal(0, 0.02, 200), [0.8, 1.9, 3.0][:dropped])
+    weights = np.full(len(yaw), 1.0)
+    found = statistics(np.append(yaw, 4.1), np.append(weights, 1e-4))
+    assert len(found.modes) == 1 and found.modes_dropped == dropped
+    assert found.weight_dropped == pytest.approx(dropped / len(yaw), abs=1e-5)
+
+
+def test_the_sd_of_a_still_scene_stays_where_the_heaviest_mode_changes() -> None:
+    """Two peaks of about equal weight, sampled anew in every image: the pose jumps, its sd does not."""
+    images = [peaked(np.random.default_rng(k), 100, [0, 180], [0.5, 0.5], 1) for k in range(40)]
+    found = [statistics(yaw, seed=k) for k, yaw in enumerate(images)]
+    assert len({round(abs(one.orientation[2])) for one in found}) == 2
+    own, whole = (np.sqrt([np.diag(getattr(one, name)) for one in found]) for name in ("covariance", "covariance_all"))
+    assert own[:, 0].max() < 1.5 * own[:, 0].min() and own[:, 0].max() < 0.003
+    assert whole[:, 0].min() > 0.05  # 12 cm apart
+    # A light mode that comes and goes: the spread over all jumps, and the sd does not.
+    light = [statistics(np.append(np.full(100, 0.01) * np.arange(100) % 0.03, np.full(n, np.pi))) for n in (0, 4)]
+    assert light[1].covariance_all[0, 0] > 20 * light[0].covariance_all[0, 0]
+    assert light[1].covariance[0, 0] == pytest.approx(light[0].covariance[0, 0], rel=0.1)
 
 
 def test_one_pose_and_equal_poses() -> None:

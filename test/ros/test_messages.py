@@ -14,6 +14,7 @@ from visualization_msgs.msg import Marker
 
 from bayes3d_ros.geometry.compressed_depth import encode_compressed_depth
 from bayes3d_ros.geometry.depth_image import encode_depth
+from bayes3d_ros.geometry.poses import look_at
 from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, summarise
 from bayes3d_ros.posterior.types import ScenePosterior, SceneSamples, UnexplainedPlace
 from bayes3d_ros.ros import detections, from_messages, to_messages
@@ -195,6 +196,13 @@ def test_poses_are_in_the_order_of_labels(library) -> None:
         np.testing.assert_allclose(from_messages.pose_to_matrix(pose)[:3, 3], estimate.position)
 
 
+def test_the_tables_transform_maps_table_coordinates_to_the_camera(library) -> None:
+    T_camera_table = np.linalg.inv(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    message = to_messages.table_transform(replace(scene(library.names), T_camera_table=T_camera_table), "table")
+    assert (message.header.frame_id, message.child_frame_id) == ("camera", "table")  # parent, child, as in tf
+    np.testing.assert_allclose(from_messages.transform_to_matrix(message.transform), T_camera_table, atol=1e-12)
+
+
 def test_markers_delete_the_old_ones_first_and_are_unique(library) -> None:
     posterior = scene(library.names)
     markers = SceneMarkers(library)(posterior).markers
@@ -250,7 +258,12 @@ def two_modes(names: tuple[str, ...]) -> ScenePosterior:
 def test_the_summary_and_the_markers_say_where_else_an_object_may_be(library) -> None:
     posterior = two_modes(library.names)
     values = {v.key: v.value for v in summary_message(posterior).status[1].values}
-    assert values["p mode"] == "1: 0.700 2: 0.300"
+    assert values["p mode"] == "1: 0.700 2: 0.300" and values["mode weight"] == "0.700"
+    wide = replace(posterior.objects[0], covariance_all=np.diag([0.132**2] * 6), modes_dropped=2, weight_dropped=0.012)
+    told = summary_message(replace(posterior, objects=(wide,))).status[1].values
+    told = {v.key: v.value for v in told}
+    assert told["sigma position mm"] == values["sigma position mm"]
+    assert told["sigma position all mm"] == "132.00 132.00 132.00" and told["modes dropped"] == "2, together p 0.0120"
     assert values["mode 2"].startswith("p 0.300, m -0.2") and "xyzw 0.0000 0.0000 1.0000 0.0000" in values["mode 2"]
     (other,) = [m for m in SceneMarkers(library)(posterior).markers if m.ns == "modes"]
     assert other.pose.orientation.z == 1.0 and other.color.a == pytest.approx(0.24)
@@ -276,7 +289,9 @@ def test_detections_are_hypotheses_of_types_and_modes(library, monkeypatch) -> N
     samples = samples._replace(orientation=turned, type=kind)
     summary = summarise(samples, library.names, 0.5)
     posterior = replace(posterior, samples=samples, objects=summary.objects, object_index=summary.object_index)
-    first, second = detections.detection_array(posterior, library).detections
+    first, second = detections.detection_array(posterior, library, ("brick_3", "cube_1")).detections
+    assert (first.id, second.id) == ("brick_3", "cube_1")
+    assert [d.id for d in detections.detection_array(posterior, library).detections] == ["1", "2"]
     scores = [result.hypothesis.score for result in first.results]
     assert scores == sorted(scores, reverse=True)
     assert sum(scores) == pytest.approx(posterior.objects[0].probability)

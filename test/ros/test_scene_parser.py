@@ -65,6 +65,8 @@ def test_a_bag_gives_every_output(ros, library_folder: Path, bag: Path) -> None:
         rows = from_messages.rows_from_cloud(received["posterior"][k])
         assert rows["object"].tolist() == [0, -1]
         assert np.exp(rows["log_weight"]).sum() == pytest.approx(1)
+        values = {pair.key: pair.value for pair in received["summary"][k].status[1].values}
+        assert values["id"] == f"brick_{k + 1}"  # it moves by a metre from image to image
     ros.wait_for(lambda: player.status is not None, "the end of the bag")
     assert player.status == 0, player.output()
     ros.wait_for_diagnosis(diagnostics, "no publisher on /depth/image_rect any more")

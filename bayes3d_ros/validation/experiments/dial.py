@@ -81,7 +81,7 @@ def _row(bag: str, particles: int, seed: int, found: ScenePosterior, seconds: fl
         "num_objects": {str(n): round(p, 5) for n, p in found.num_objects.items()},
         "types": [o.type for o in objects],
         "positions": [[round(float(a), 6) for a in o.position] for o in objects],
-        "sigmas": [[round(float(np.sqrt(v)), 6) for v in np.diag(o.covariance)[:3]] for o in objects],
+        "sigmas": [[round(float(np.sqrt(v)), 6) for v in np.diag(o.covariance_all)[:3]] for o in objects],
     }
 
 

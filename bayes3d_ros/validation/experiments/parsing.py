@@ -201,7 +201,7 @@ def _object_row(
         row |= _sureness(estimate)
         if thing.T_camera_object is not None:
             pose, truth = estimated_pose(estimate), thing.T_camera_object
-            error, covariance = truth[:3, 3] - estimate.position, np.asarray(estimate.covariance[:3, :3], float)
+            error, covariance = truth[:3, 3] - estimate.position, np.asarray(estimate.covariance_all[:3, :3], float)
             outside, distance = distance_outside(error, covariance, REGION)
             row["add_s"] = round(add_s(surfaces(thing.type), truth, pose), 7)
             row["position_error"] = round(translation_error(truth, pose), 7)
@@ -216,7 +216,7 @@ def _sureness(estimate: ObjectEstimate) -> Row:
     return {
         "probability": round(float(estimate.probability), 6),
         "type_probability": round(float(estimate.type_probabilities[estimate.type]), 6),
-        "sigma": round(float(np.sqrt(np.trace(estimate.covariance[:3, :3]))), 7),
+        "sigma": round(float(np.sqrt(np.trace(estimate.covariance_all[:3, :3]))), 7),
     }
 
 

@@ -108,7 +108,7 @@ def _means_apart(first: ScenePosterior, i: int, second: ScenePosterior, j: int) 
 
 def _poses_apart(a: ObjectEstimate, b: ObjectEstimate) -> float:
     """The same of the published positions and standard deviations: two runs may call either of two modes heaviest."""
-    sigma = np.sqrt(0.5 * (np.diag(a.covariance) + np.diag(b.covariance)))[:3]
+    sigma = np.sqrt(0.5 * (np.diag(a.covariance_all) + np.diag(b.covariance_all)))[:3]
     return float((np.abs(a.position - b.position) / np.maximum(sigma, 1e-9)).max())
 
 

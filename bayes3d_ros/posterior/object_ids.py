@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Ids that tell which objects of an image are those of images before: what a node remembers, and no parser knows."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior
+
+SAME_PLACE = 0.05  # metres between two images, within which an object of the same type is the same one
+REMEMBERED_NS = 10 * 10**9  # between the stamps of two images, after which an object that was not seen is forgotten
+
+
+class NamedObject(NamedTuple):
+    """An object that was seen: where, in the frame of its memory (metres), and in which image."""
+
+    id: str
+    type: str
+    position: Float[np.ndarray, "3"]
+    seen_ns: int
+
+
+class IdMemory(NamedTuple):
+    """Objects that have an id, all seen in one frame, in the order of their ids; how many ids every type has had."""
+
+    frame_id: str = ""
+    objects: tuple[NamedObject, ...] = ()
+    counts: tuple[tuple[str, int], ...] = ()
+
+
+def named(memory: IdMemory, posterior: ScenePosterior) -> tuple[tuple[str, ...], IdMemory]:
+    """Ids `TYPE_K` of the objects of a scene, K = 1, 2, ..., and what is remembered after it.
+
+    An object keeps the id of one of the same type that was within SAME_PLACE of it in the frame that poses are told
+    in: as many pairs as can be, one to one, and of these the smallest sum of distances. All others get new ids, in the
+    order of `objects`. An id that is forgotten is not given again. What was seen in another frame is forgotten.
+    """
+    known = [
+        thing
+        for thing in memory.objects
+        if memory.frame_id == posterior.pose_frame_id and abs(posterior.stamp_ns - thing.seen_ns) <= REMEMBERED_NS
+    ]
+    ids = _kept(known, posterior.objects)
+    counts = Counter(dict(memory.counts))
+    for k, found in enumerate(posterior.objects):
+        if k not in ids:
+            counts[found.type] += 1
+            ids[k] = f"{found.type}_{counts[found.type]}"
+    seen = [
+        NamedObject(ids[k], found.type, np.asarray(found.position, float), posterior.stamp_ns)
+        for k, found in enumerate(posterior.objects)
+    ]
+    unseen = [thing for thing in known if thing.id not in ids.values()]
+    objects = tuple(sorted((*seen, *unseen), key=lambda thing: thing.id))
+    remembered = IdMemory(posterior.pose_frame_id, objects, tuple(sorted(counts.items())))
+    return tuple(ids[k] for k in range(len(posterior.objects))), remembered
+
+
+def _kept(known: Sequence[NamedObject], objects: Sequence[ObjectEstimate]) -> dict[int, str]:
+    """The ids of objects that were seen before, by their place in `objects`."""
+    if not known or not objects:
+        return {}
+    apart = cdist([found.position for found in objects], [thing.position for thing in known])
+    same_type = np.array([[found.type == thing.type for thing in known] for found in objects])
+    may_be = same_type & (apart <= SAME_PLACE)
+    # A pair more is worth more than all distances together.
+    pairs = linear_sum_assignment(np.where(may_be, apart, (1 + min(apart.shape)) * SAME_PLACE))
+    return {int(k): known[n].id for k, n in zip(*pairs, strict=True) if may_be[k, n]}
