@@ -67,104 +67,191 @@ def _near_before_far(near: float, far: float) -> None:
 class ParserSettings:
     """Settings of the scene parser. The model's own come first, the sampler's after them."""
 
-    max_objects: int = setting(12, "most objects a scene may hold", low=0, high=32)
-    fixed_objects: int = setting(-1, "parse exactly this many objects; -1 infers the number", low=-1, high=32)
-    count_ratio: float = setting(0.1, "ratio P(n+1) / P(n) of the prior on the number of objects", low=1e-6, high=1.0)
-    table: str = setting("auto", "where the table's plane comes from", choices=("auto", "pose", "depth"))
+    max_objects: int = setting(12, "largest number of objects in a scene", low=0, high=32)
+    fixed_objects: int = setting(
+        -1, "number of objects in every scene, where it is known; -1: infer the number", low=-1, high=32
+    )
+    count_ratio: float = setting(0.1, "prior on the number n of objects: the ratio P(n+1) / P(n)", low=1e-6, high=1.0)
+    table: str = setting(
+        "auto",
+        "source of the table plane: the camera pose if there is one, else the depth image (auto); the camera "
+        "pose only, frames without one are refused (pose); the depth image only (depth)",
+        choices=("auto", "pose", "depth"),
+    )
     table_width: float = setting(
-        1.2, "width of the table's prior area, along x of the table frame", unit="m", low=0.1, high=10.0
+        1.2,
+        "extent of the area in which objects are searched, along x of the table frame, centred on its origin",
+        unit="m",
+        low=0.1,
+        high=10.0,
     )
     table_depth: float = setting(
-        1.2, "depth of the table's prior area, along y of the table frame", unit="m", low=0.1, high=10.0
+        1.2,
+        "extent of the area in which objects are searched, along y of the table frame, centred on its origin",
+        unit="m",
+        low=0.1,
+        high=10.0,
     )
     workspace_height: float = setting(
-        0.5, "returns higher above the table are not parsed", unit="m", low=0.02, high=10.0
+        0.5,
+        "height of the space above the table in which objects are searched; higher returns are treated as background",
+        unit="m",
+        low=0.02,
+        high=10.0,
     )
-    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
-    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
+    near: float = setting(
+        0.1,
+        "smallest depth that counts as a measurement; smaller ones are treated as missing",
+        unit="m",
+        low=0.01,
+        high=100.0,
+    )
+    far: float = setting(
+        5.0,
+        "largest depth that counts as a measurement; larger ones are treated as missing",
+        unit="m",
+        low=0.1,
+        high=100.0,
+    )
     score_width: int = setting(
-        160, "width of the image that is scored; part of the model", unit="px", low=16, high=1280
+        160,
+        "width to which the depth image is reduced before it is compared with rendered scenes; smaller is "
+        "faster and less accurate",
+        unit="px",
+        low=16,
+        high=1280,
     )
     likelihood: str = setting(
         "depth",
-        "what a return is scored as: the depth of its pixel, with errors that its neighbours share; the same without "
-        "such errors (too sure on real images); or the paper's free 3D point (too sure of the noise)",
+        "noise model of a depth pixel. depth: neighbouring pixels share errors (the only model that reports "
+        "unknown objects); independent: independent errors, overconfident on real images; points: the "
+        "independent 3D points of the Bayes3D paper, which underestimates the noise",
         choices=("depth", "independent", "points"),
     )
-    window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
+    window: int = setting(
+        3,
+        "side of the square of rendered pixels that an observed pixel is compared with; odd, and 3 with "
+        "likelihood: depth",
+        unit="px",
+        low=1,
+        high=9,
+    )
     sigma_max: float = setting(
-        0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
+        0.005,
+        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
+        unit="m",
+        low=1e-4,
+        high=0.1,
     )
     surface_bias: float = setting(
-        0.0012, "standard deviation of depth errors that all returns of an object share", unit="m", low=0.0, high=0.05
+        0.0012,
+        "standard deviation of a constant depth error of each object: one value for all of its pixels",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
     surface_waves: float = setting(
-        0.001, "standard deviation of depth errors that are waves over a surface", unit="m", low=0.0, high=0.05
+        0.001,
+        "standard deviation of a smooth depth error that varies over a surface, as a wavy pattern does",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
     wave_length: float = setting(
-        0.05, "distance over which such waves are alike (to a correlation of 1/e)", unit="m", low=0.005, high=1.0
+        0.05,
+        "correlation length of surface_waves: the distance at which the correlation has fallen to 1/e",
+        unit="m",
+        low=0.005,
+        high=1.0,
     )
     model_error: float = setting(
         0.001,
-        "standard deviation of an object's surface about its model, alike over 15 mm",
+        "standard deviation of the distance between an object and its model, in patches of 15 mm",
         unit="m",
         low=0.0,
         high=0.05,
     )
     object_lean: float = setting(
         0.015,
-        "standard deviation by which an object leans against how its model rests, in either direction",
+        "standard deviation of how far an object tilts from the resting pose of its model, about each horizontal axis",
         unit="rad",
         low=0.0,
         high=0.3,
     )
     bad_share: float = setting(
         0.04,
-        "how often a spot (15 mm) of an object's surface is dented, worn or badly seen, by up to 2 cm towards the "
-        "camera; one dent covers several spots, which the model counts one by one",
+        "probability that a patch of 15 mm of an object is dented, worn or badly measured, by up to 2 cm "
+        "towards the camera; a dent of several patches counts once for each",
         low=0.0,
         high=0.9,
     )
     edge_share: float = setting(
-        0.1, "share of returns at the edges of surfaces that lie anywhere between them", low=0.0, high=0.9
+        0.1,
+        "probability that a return at a depth edge lies anywhere between the front and the back surface",
+        low=0.0,
+        high=0.9,
     )
     edge_blur: float = setting(
         0.7,
-        "standard deviation of how far beside its ray a return at an edge may come from",
+        "standard deviation of the sideways displacement of a return at a depth edge, in pixels of the reduced image",
         unit="scored px",
         low=0.0,
         high=3.0,
     )
     outline_sigma: float = setting(
         0.13,
-        "standard deviation by which an object's whole picture, its outline, stands beside the object",
+        "standard deviation of the sideways displacement of an object's whole outline, in pixels of the reduced image",
         unit="scored px",
         low=0.0,
         high=3.0,
     )
     image_bias: float = setting(
-        0.001, "standard deviation of depth errors that the whole image shares", unit="m", low=0.0, high=0.05
+        0.001, "standard deviation of a constant depth error of the whole image", unit="m", low=0.0, high=0.05
     )
     camera_position_sigma: float = setting(
-        0.002, "standard deviation of a given camera pose's height over the table", unit="m", low=0.0, high=0.1
+        0.002, "standard deviation of the height of a given camera pose above the table", unit="m", low=0.0, high=0.1
     )
     camera_angle_sigma: float = setting(
-        0.005, "standard deviation of a given camera pose's tilts", unit="rad", low=0.0, high=0.2
+        0.005,
+        "standard deviation of the two tilts of a given camera pose relative to the table",
+        unit="rad",
+        low=0.0,
+        high=0.2,
     )
-    unknown: bool = setting(True, "whether a thing may be of no type in the library")
+    unknown: bool = setting(
+        True, "whether an object may be of no type in the library; it is then reported as unknown, with a box"
+    )
     unknown_probability: float = setting(
-        0.1, "prior probability that a thing is of no type in the library", low=1e-6, high=0.999
+        0.1, "prior probability that an object is of no type in the library", low=1e-6, high=0.999
     )
-    min_probability: float = setting(0.5, "objects are listed from this probability of existing", low=0.0, high=1.0)
-    particles: int = setting(96, "scenes carried by the sampler", low=1, high=100000)
-    ess_threshold: float = setting(0.3, "resample below this fraction of effective particles", low=0.0, high=1.0)
+    min_probability: float = setting(
+        0.5, "smallest probability of existence at which an object is listed in the results", low=0.0, high=1.0
+    )
+    particles: int = setting(
+        96,
+        "number of scenes (particles) of the sequential Monte Carlo sampler; more cost time and give steadier results",
+        low=1,
+        high=100000,
+    )
+    ess_threshold: float = setting(
+        0.3, "resample when the effective sample size falls below this fraction of the particles", low=0.0, high=1.0
+    )
     rejuvenated_objects: int = setting(
-        1, "objects of a finished scene that are moved again given the others", low=0, high=100
+        1, "number of objects resampled by MCMC moves after the last object is added", low=0, high=100
     )
     tempering_steps: int = setting(
-        0, "steps by which their posterior is flattened meanwhile, to get from peak to peak", low=0, high=20
+        0,
+        "number of steps in which the posterior is flattened and sharpened again during those MCMC moves, to "
+        "move between distant modes",
+        low=0,
+        high=20,
     )
-    seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
+    seed: int = setting(
+        0,
+        "seed of the random numbers; combined with each image's stamp, so that an image always gives the same result",
+        low=0,
+        high=2**31 - 1,
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -192,31 +279,70 @@ class ParserSettings:
 class LearnerSettings:
     """Settings of the object learner. Lengths are metres in the table frame."""
 
-    voxel_size: float = setting(0.004, "edge of a voxel of the learned model", unit="m", low=0.001, high=0.05)
-    workspace_x: float = setting(0.0, "middle of the workspace, along x of the table frame", unit="m")
-    workspace_y: float = setting(0.0, "middle of the workspace, along y of the table frame", unit="m")
-    workspace_width: float = setting(1.0, "extent of the workspace along x", unit="m", low=0.05, high=10.0)
-    workspace_depth: float = setting(1.0, "extent of the workspace along y", unit="m", low=0.05, high=10.0)
-    workspace_height: float = setting(0.5, "returns higher above the table are left out", unit="m", low=0.02, high=10.0)
-    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
-    far: float = setting(3.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
-    gap: float = setting(0.02, "things that stand this far apart are several", unit="m", low=0.002, high=1.0)
+    voxel_size: float = setting(0.004, "edge length of a voxel of the learned model", unit="m", low=0.001, high=0.05)
+    workspace_x: float = setting(0.0, "centre of the workspace, along x of the table frame", unit="m")
+    workspace_y: float = setting(0.0, "centre of the workspace, along y of the table frame", unit="m")
+    workspace_width: float = setting(
+        1.0, "extent of the workspace, along x of the table frame", unit="m", low=0.05, high=10.0
+    )
+    workspace_depth: float = setting(
+        1.0, "extent of the workspace, along y of the table frame", unit="m", low=0.05, high=10.0
+    )
+    workspace_height: float = setting(
+        0.5, "height of the workspace above the table; higher returns are ignored", unit="m", low=0.02, high=10.0
+    )
+    near: float = setting(
+        0.1,
+        "smallest depth that counts as a measurement; smaller ones are treated as missing",
+        unit="m",
+        low=0.01,
+        high=100.0,
+    )
+    far: float = setting(
+        3.0,
+        "largest depth that counts as a measurement; larger ones are treated as missing",
+        unit="m",
+        low=0.1,
+        high=100.0,
+    )
+    gap: float = setting(
+        0.02,
+        "smallest distance between two objects; returns that are closer are taken for one object",
+        unit="m",
+        low=0.002,
+        high=1.0,
+    )
     cluster: str = setting(
         "only",
-        "which of several things to learn: refuse to choose, the largest, or the one nearest to the workspace's middle",
+        "which object to learn if the workspace holds several: none, the view is refused (only); the largest;"
+        " or the one nearest to the centre of the workspace (central)",
         choices=("only", "largest", "central"),
     )
     at_x: float = setting(
         math.nan,
-        "with at_y: learn the thing nearest to this place on the table, whatever cluster says; along x of the table "
-        "frame, as in table_position of scene_parser's results; .nan for no place",
+        "with at_y: learn the object nearest to this place on the table, whatever cluster says; x in the "
+        "table frame, as in table_position of the results of scene_parser; .nan: no place",
         unit="m",
     )
-    at_y: float = setting(math.nan, "the same along y; .nan for no place", unit="m")
-    max_shift: float = setting(
-        0.03, "largest error of a camera pose that is corrected, at the object", unit="m", low=0.0, high=0.5
+    at_y: float = setting(
+        math.nan,
+        "with at_x: learn the object nearest to this place on the table; y in the table frame; .nan: no place",
+        unit="m",
     )
-    max_turn: float = setting(0.09, "largest such error of its orientation", unit="rad", low=0.0, high=0.5)
+    max_shift: float = setting(
+        0.03,
+        "largest error of a camera pose, at the object, that is corrected; a view with a larger one is left out",
+        unit="m",
+        low=0.0,
+        high=0.5,
+    )
+    max_turn: float = setting(
+        0.09,
+        "largest tilt of the table against the camera pose that is corrected; a view with a larger one is refused",
+        unit="rad",
+        low=0.0,
+        high=0.5,
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -248,51 +374,131 @@ class TrackerSettings:
     """Settings of the camera tracker."""
 
     hypotheses: int = setting(
-        1024, "camera poses rendered and scored for every frame; a third are the filter's own", low=460, high=1000000
+        1024,
+        "number of camera poses rendered and scored per image; more cost time and give steadier results",
+        low=460,
+        high=1000000,
     )
-    score_width: int = setting(40, "width of the image that is scored", unit="px", low=8, high=1280)
-    window: int = setting(3, "side of the likelihood's pixel window, odd", unit="px", low=1, high=9)
+    score_width: int = setting(
+        40,
+        "width to which the depth image is reduced before it is compared with rendered scenes; smaller is "
+        "faster and less accurate",
+        unit="px",
+        low=8,
+        high=1280,
+    )
+    window: int = setting(
+        3,
+        "side of the square of rendered pixels that an observed pixel is compared with; odd",
+        unit="px",
+        low=1,
+        high=9,
+    )
     sigma_max: float = setting(
-        0.005, "largest depth noise considered, a standard deviation", unit="m", low=1e-4, high=0.1
+        0.005,
+        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
+        unit="m",
+        low=1e-4,
+        high=0.1,
     )
-    near: float = setting(0.1, "nearest depth that counts as a return", unit="m", low=0.01, high=100.0)
-    far: float = setting(5.0, "farthest depth that counts as a return", unit="m", low=0.1, high=100.0)
-    table: bool = setting(True, "whether the table is seen too, and not only the objects on it")
+    near: float = setting(
+        0.1,
+        "smallest depth that counts as a measurement; smaller ones are treated as missing",
+        unit="m",
+        low=0.01,
+        high=100.0,
+    )
+    far: float = setting(
+        5.0,
+        "largest depth that counts as a measurement; larger ones are treated as missing",
+        unit="m",
+        low=0.1,
+        high=100.0,
+    )
+    table: bool = setting(True, "whether images show the table too; false: only the objects are used for tracking")
     speed_change: float = setting(
-        0.3, "by how much the camera's velocity may change from frame to frame", unit="m/s", low=0.001, high=100.0
+        0.3,
+        "scale of the change of the camera's velocity from one image to the next",
+        unit="m/s",
+        low=0.001,
+        high=100.0,
     )
     turn_change: float = setting(
-        0.9, "by how much its angular velocity may change from frame to frame", unit="rad/s", low=0.001, high=100.0
+        0.9,
+        "scale of the change of the camera's angular velocity from one image to the next",
+        unit="rad/s",
+        low=0.001,
+        high=100.0,
     )
     frame_time: float = setting(
-        0.033, "time between frames where there is no earlier one", unit="s", low=0.001, high=10.0
+        0.033, "time between images that is assumed for the first image", unit="s", low=0.001, high=10.0
     )
     longest_gap: float = setting(
-        1.0, "after so long without a frame the camera is looked for anew", unit="s", low=0.01, high=60.0
+        1.0,
+        "longest time between two images over which the camera is tracked; after a longer one it is searched for",
+        unit="s",
+        low=0.01,
+        high=60.0,
     )
     nearest_camera: float = setting(
         0.3,
-        "how near to the objects a camera is looked for in a known world without a table",
+        "minimum distance of the camera from the objects when searching for a lost camera in a known world "
+        "without a table",
         unit="m",
         low=0.05,
         high=100.0,
     )
-    farthest_camera: float = setting(1.5, "how far from them it is looked for there", unit="m", low=0.05, high=100.0)
-    lowest_camera: float = setting(0.2, "how low it may look down at them there", unit="rad", low=-1.5, high=1.5)
-    highest_camera: float = setting(1.4, "how steeply it may look down at them there", unit="rad", low=-1.5, high=1.5)
+    farthest_camera: float = setting(
+        1.5,
+        "maximum distance of the camera from the objects when searching for a lost camera in a known world "
+        "without a table",
+        unit="m",
+        low=0.05,
+        high=100.0,
+    )
+    lowest_camera: float = setting(
+        0.2,
+        "minimum camera elevation above the objects when searching for a lost camera in a known world without a table",
+        unit="rad",
+        low=-1.5,
+        high=1.5,
+    )
+    highest_camera: float = setting(
+        1.4,
+        "maximum camera elevation above the objects when searching for a lost camera in a known world without a table",
+        unit="rad",
+        low=-1.5,
+        high=1.5,
+    )
     least_explained: float = setting(
-        0.5, "share of the objects' pixels that have to be explained, or the camera is lost", low=0.0, high=1.0
+        0.5,
+        "smallest share of the objects' pixels that must agree with the predicted image; below it the camera is lost",
+        low=0.0,
+        high=1.0,
     )
     depth_bias: float = setting(
-        0.0015, "standard deviation of depth errors that all pixels share", unit="m", low=0.0, high=0.05
+        0.0015, "standard deviation of a constant depth error of the whole image", unit="m", low=0.0, high=0.05
     )
     depth_waviness: float = setting(
-        0.0017, "standard deviation of depth errors that are waves over surfaces", unit="m", low=0.0, high=0.05
+        0.0017,
+        "standard deviation of a smooth depth error that varies over a surface, as a wavy pattern does",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
     waviness_length: float = setting(
-        0.05, "distance over which such waves are alike (to exp(-1/2))", unit="m", low=0.005, high=1.0
+        0.05,
+        "correlation length of depth_waviness: the distance at which the correlation has fallen to exp(-1/2)",
+        unit="m",
+        low=0.005,
+        high=1.0,
     )
-    seed: int = setting(0, "seed of the random numbers; every frame adds its stamp", low=0, high=2**31 - 1)
+    seed: int = setting(
+        0,
+        "seed of the random numbers; combined with each image's stamp, so that an image always gives the same result",
+        low=0,
+        high=2**31 - 1,
+    )
 
     def __post_init__(self) -> None:
         validate(self)

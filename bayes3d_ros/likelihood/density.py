@@ -136,7 +136,8 @@ def ray_mixture(
 def point_density(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, sigma: Float[Array, "S"], window: int
 ) -> Float[Array, "S h w T"]:
-    """The sum over the window of free points' density, per pixel and metre; `rendered` as in `inlier_density`."""
+    """The sum over the window of free points' density, per pixel and metre; `rendered` as in `inlier_density`. It is
+    the sum of Bayes3D's eq. 1, truncated to a window as in its Methodology, B."""
     half = window // 2
     height, width = pixels.depth.shape[:2]
     a, b, z = pixels.ray_x, pixels.ray_y, pixels.depth

@@ -60,7 +60,8 @@ def T_camera_object(placement: Placement, library: LibraryArrays, table: Table) 
 
 def log_prior(placement: Placement, library: LibraryArrays, table: Table) -> Float[Array, "*batch"]:
     """log p(type, face, x, y, yaw): uniform over types and faces, over the table's rectangle shrunk by the face's width
-    and height, and over [0, 2 pi). Density per metre^2 and radian. Minus infinity outside."""
+    and height, and over [0, 2 pi). Density per metre^2 and radian. Minus infinity outside. It is p(o_i, c_i, phi_i) of
+    Bayes3D (Methodology, A (i); lines 4 to 6 of its Algorithm 1)."""
     free = jnp.maximum(table.size - library.face_size[placement.type, placement.face], 1e-3)
     inside = (jnp.abs(placement.x) <= free[..., 0] / 2) & (jnp.abs(placement.y) <= free[..., 1] / 2)
     inside &= (placement.type >= 0) & (placement.type < library.num_types)

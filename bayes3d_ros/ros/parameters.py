@@ -42,33 +42,35 @@ class DepthInputSettings:
 
     qos_reliability: str = setting(
         "auto",
-        "reliability of the input subscriptions; auto is reliable until a best-effort publisher is met",
+        "reliability of the input subscriptions; auto: reliable, unless a publisher offers only best effort",
         choices=("auto", "reliable", "best_effort"),
     )
     depth_transport: str = setting(
         RAW,
-        "how depth images come: raw, as Image on depth/image_rect; compressedDepth, as CompressedImage of "
-        "image_transport on depth/image_rect/compressedDepth",
+        "transport of the depth images. raw: sensor_msgs/Image on depth/image_rect; compressedDepth: "
+        "sensor_msgs/CompressedImage of image_transport on depth/image_rect/compressedDepth",
         choices=tuple(TRANSPORTS),
     )
-    table_frame: str = setting("table", "frame of the table: z up, origin on the table")
+    table_frame: str = setting("table", "name of the table frame in tf: z up, origin on the surface of the table")
     camera_pose: tuple[float, ...] = setting(
-        (), "camera pose in table_frame where no topic or tf gives one: x y z qx qy qz qw; empty for none"
+        (),
+        "pose of the camera optical frame in table_frame, for a camera that no topic and no tf tells of: x y "
+        "z qx qy qz qw; empty: none",
     )
     patience: float = setting(
-        0.5, "how long an image waits for its CameraInfo and camera pose", unit="s", low=0.0, high=10.0
+        0.5, "longest time that an image waits for its CameraInfo and its camera pose", unit="s", low=0.0, high=10.0
     )
     pose_max_gap: float = setting(
         0.2,
-        "longest gap between two poses on camera_pose between which the pose of an image is interpolated",
+        "longest time between two messages on camera_pose between which the pose of an image is interpolated",
         unit="s",
         low=0.0,
         high=10.0,
     )
     pose_tolerance: float = setting(
         0.05,
-        "largest difference between the stamps of an image and of the nearest pose, which serves where none can be "
-        "interpolated when the image has waited for `patience`",
+        "largest time between an image and the nearest camera pose that is used when none can be interpolated"
+        " and the image has waited for patience",
         unit="s",
         low=0.0,
         high=10.0,
@@ -87,24 +89,36 @@ class DepthInputSettings:
 class SceneParserNodeSettings(DepthInputSettings):
     """What the scene_parser node needs beside the parser's own settings."""
 
-    library: str = setting("", "folder of object models (bayes3d import); read on configure and on reload")
+    library: str = setting(
+        "", "folder of object models, made by bayes3d import or learn; read on configure and on ~/reload_library"
+    )
     output_frame: str = setting(
         "",
-        "frame of the poses that are published; empty: the camera's optical frame; table: the table's (table_frame); "
-        "or any frame that tf connects with the camera or the table. Images stay in the camera's frame",
+        "frame of the published poses. Empty: the camera's optical frame; table: the table frame; or any "
+        "frame that tf connects with the camera or the table. Images stay in the camera's frame",
     )
     camera_pose_sigma: tuple[float, ...] = setting(
         (0.0, 0.0),
-        "standard deviations of the camera's pose along (m) and about (rad) each axis, which covariances outside the "
-        "camera's frame hold; on the table they move x, y and yaw alone",
+        "standard deviations of the camera pose along (m) and about (rad) each axis; covariances in frames "
+        "other than that of the camera include them",
         unit="m, rad",
     )
     publish_tf: bool = setting(
-        False, "send the transform of every object to tf, from the frame of the poses to NODE/ID; needs tf2_ros"
+        False, "send the pose of every object to tf, as the frame NODE/ID below the frame of the poses; needs tf2_ros"
     )
-    autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
-    warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
-    warm_up_height: int = setting(480, "height of the images to compile for before the first one", unit="px", low=0)
+    autostart: bool = setting(True, "configure and activate when the node starts; false: wait for a lifecycle manager")
+    warm_up_width: int = setting(
+        640,
+        "width of the images for which code is compiled before the first image comes; 0: wait for the first image",
+        unit="px",
+        low=0,
+    )
+    warm_up_height: int = setting(
+        480,
+        "height of the images for which code is compiled before the first image comes; 0: wait for the first image",
+        unit="px",
+        low=0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,12 +132,12 @@ class ObjectLearnerNodeSettings(DepthInputSettings):
     """What the object_learner node needs beside the learner's own settings."""
 
     library: str = setting("", "folder of object models; captures are kept in its subfolder captures/OBJECT_NAME")
-    object_name: str = setting("", "what to call the object: letters, digits, '_' and '-'")
+    object_name: str = setting("", "name of the object to learn: letters, digits, '_' and '-'")
     replace: bool = setting(
-        False, "write over a model of this name that the library held before; without it ~/build refuses"
+        False, "whether ~/build may replace a model of this name that the library already holds; false: it refuses"
     )
     max_age: float = setting(
-        2.0, "the newest image is not captured if it came longer ago than this", unit="s", low=0.1, high=3600.0
+        2.0, "largest age of the newest image at which ~/capture still takes it", unit="s", low=0.1, high=3600.0
     )
 
     def __post_init__(self) -> None:
@@ -139,10 +153,14 @@ class ObjectLearnerNodeSettings(DepthInputSettings):
 class CameraTrackerNodeSettings(DepthInputSettings):
     """What the camera_tracker node needs beside the tracker's own settings."""
 
-    library: str = setting("", "folder of object models (bayes3d import); read when the node starts and on ~/reset")
-    world: str = setting("", "file of known objects and their poses in table_frame; empty: what the first frame shows")
-    path_length: int = setting(1000, "poses kept on ~/path", low=1, high=1000000)
-    most_particles: int = setting(200, "poses on ~/particles, drawn from the filter's", low=1, high=100000)
+    library: str = setting(
+        "", "folder of object models, made by bayes3d import or learn; read when the node starts and on ~/reset"
+    )
+    world: str = setting(
+        "", "yaml file of known objects and their poses in table_frame; empty: the objects that the first image shows"
+    )
+    path_length: int = setting(1000, "number of poses kept on ~/path", low=1, high=1000000)
+    most_particles: int = setting(200, "largest number of poses on ~/particles", low=1, high=100000)
 
 
 SCENE_PARSER_SETTINGS: tuple[type, ...] = (SceneParserNodeSettings, ParserSettings)

@@ -33,7 +33,7 @@ _CAMERAS_AT_A_TIME = 64  # of those that somebody suggests: one compilation for 
 
 
 class LookAt(NamedTuple):
-    """Intervals of the prior; azimuths go all around."""
+    """Intervals of the camera pose prior (Bayes3D, Methodology, A (ii)); azimuths go all around."""
 
     nearest: float  # metres from the target
     farthest: float
