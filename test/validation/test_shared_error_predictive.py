@@ -168,3 +168,16 @@ def test_calibration_finds_noise_that_is_too_large(monkeypatch):
     """Ranks of sigma given an empty table: uniform, and not where images are 1.5 times as noisy as the truth says."""
     assert kstest(noise_ranks(1.0, monkeypatch), "uniform").pvalue > 0.01
     assert kstest(noise_ranks(1.5, monkeypatch), "uniform").pvalue < 1e-4
+
+
+@pytest.mark.parametrize(("off", "slope"), [(-0.020, 0.0), (0.010, 1.0)])
+def test_excuses_end_gradually(off, slope):
+    """A cell 2 cm in front of the plate, and a sloping one 1 cm behind it: a tenth of a millimetre of the plate's pose
+    does not change the density by tens of nats."""
+    noise = 0.0012 * np.random.default_rng(0).standard_normal(BARE.shape)
+    depth = plate().depth + noise / np.sqrt(1 + RAYS.x**2 + RAYS.y[:, None] ** 2)
+    depth[6:9, 9:12] += off + slope * 0.0049 * np.arange(-1, 2)
+    image = image_of(depth)
+    steps = np.arange(-1e-3, 1.01e-3, 1e-4)
+    values = [log_value(image, plate(step), ERRORS, AMPLITUDES) for step in steps]
+    assert np.abs(np.diff(values)).max() < 1.7
