@@ -31,6 +31,7 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle, types_of
 from bayes3d_ros.ros.publishers import ScenePublishers
+from bayes3d_ros.ros.scene_outputs import ToldScene
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
 
@@ -249,7 +250,7 @@ class SceneParserNode(Node):
         ids, self._ids = named(self._ids, told)
         if transforms is not None:  # before messages that name the ids
             transforms.send(told, ids)
-        self._outputs.scene(told, ids, ready, frames.table_frame)
+        self._outputs.scene(ToldScene(told, ids, ready.parser.library, ready.markers, frames.table_frame))
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 
