@@ -33,7 +33,7 @@ def camera_poses(contents: BagContents, depth_topic: str, table_frame: str) -> C
         return TopicPoses(contents, pose_topic)
     tf_topics = choose_tf_topics(contents, depth_topic)
     if tf_topics:
-        return TfPoses(contents, tf_topics, table_frame, contents.images[depth_topic])
+        return RecordedTransforms(contents, tf_topics, table_frame, contents.images[depth_topic])
     return NoPoses()
 
 
@@ -66,7 +66,7 @@ class TopicPoses:
         return self._poses.get(stamp) if self._static is None else self._static
 
 
-class TfPoses:
+class RecordedTransforms:
     """Transforms of tf that lead from `table_frame` to the image's frame: interpolated at the image's stamp, never
     extrapolated. Transforms that are not finite or not rigid are left out, as tf2 does."""
 
