@@ -2,7 +2,8 @@
 
 """Messages into one MCAP file, as `ros2 bag play`, RViz and Foxglove read it: CDR, with definitions as ros2msg."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ class MessageFile:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        with self._open:
+        with self._open, self._naming_the_file():
             self._writer.finish()
 
     def add_topic(self, topic: str, msgtype: str, definition: str, latched: bool = False) -> None:
@@ -47,8 +48,16 @@ class MessageFile:
 
     def write(self, topic: str, data: bytes, stamp_ns: int) -> None:
         """Append a message of a topic that was announced: its CDR bytes, and the stamp that it is logged at."""
-        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._count)
+        with self._naming_the_file():
+            self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._count)
         self._count += 1
+
+    @contextmanager
+    def _naming_the_file(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # a full disk; its error does not say where
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
 
 def _profile(latched: bool) -> dict[str, Any]:
