@@ -29,7 +29,7 @@ MEASURED_THROUGH_NODES = {
 ROS_PACKAGES = {
     *("rclpy", "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "std_msgs", "std_srvs", "geometry_msgs"),
     *("sensor_msgs", "visualization_msgs", "diagnostic_msgs", "nav_msgs", "rosgraph_msgs", "tf2_ros", "vision_msgs"),
-    *("ament_index_python", "launch", "launch_ros", "tf2_msgs"),
+    *("ament_index_python", "launch", "launch_ros", "tf2_msgs", "shape_msgs", "moveit_msgs"),
 }
 # Import name -> key in package.xml, where they differ; those without a rosdep key are named in its comment.
 KEYS = {

@@ -10,11 +10,13 @@ import click
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
 from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
+from bayes3d_ros.cli.recording import NoRecording, mcap_option, recordings
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
     from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.objects.model import Library
+    from bayes3d_ros.ros.recording import SceneRecording
     from bayes3d_ros.settings import ParserSettings
 
 
@@ -36,6 +38,7 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
     metavar="METRES RADIANS",
     help="Standard deviations of recorded camera poses, for what is told in the table's frame.",
 )
+@mcap_option("scene_parser")
 @table_frame_option
 @device_option
 def parse(
@@ -46,6 +49,7 @@ def parse(
     table_frame: str,
     more: tuple[str, ...],
     sigma: tuple[float, float],
+    mcap: Path | None,
     **options: Any,
 ) -> None:
     """Parse every depth frame of BAG into a posterior over scenes."""
@@ -55,20 +59,27 @@ def parse(
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.settings import ParserSettings
 
+    writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
     results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)
-    done, failed = _parse_frames(frames, models, settings, results)
+    told = (mcap, table_frame, models, settings.knows_unknown)
+    recording = writers.SceneRecording(*told) if writers else NoRecording()
+    done, failed = _parse_frames(frames, models, settings, results, recording)
     if failed and not done:
         raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
     parsed = f"{done} frame{'s' * (done != 1)} parsed" + (f", {failed} could not be" if failed else "")
-    click.echo(f"{parsed}; results in {out}")
+    click.echo(f"{parsed}; results in {out}" + (f" and {mcap}" if mcap else ""))
 
 
 def _parse_frames(
-    frames: "FrameReader", library: "Library", settings: "ParserSettings", writer: "ResultsWriter"
+    frames: "FrameReader",
+    library: "Library",
+    settings: "ParserSettings",
+    writer: "ResultsWriter",
+    recording: "SceneRecording | NoRecording",
 ) -> tuple[int, int]:
     """How many frames were parsed, and how many could not be."""
     from bayes3d_ros.io.plots import plot_scene
@@ -80,18 +91,20 @@ def _parse_frames(
     parser = SceneParser(library, settings)
     failed = 0
     notes: tuple[str, ...] = ()
-    with writer as results:
+    with writer as results, recording:
         for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
             if not parser.compiled_for(camera.width, camera.height):
                 with timed(COMPILING):  # beforehand, so that `seconds` are those of a running system
                     parser.warm_up(camera.width, camera.height)
+            recording.frame(frame)
             try:
                 posterior = parser.parse(frame)
             except ParseError as error:
                 failed += 1
                 say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
                 continue
+            recording.scene(posterior)
             picture = results.write(frame.depth, posterior)
             title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
             plot_scene(frame.depth, posterior, picture, title, camera)

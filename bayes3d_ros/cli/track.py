@@ -4,13 +4,22 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from bayes3d_ros.cli.lines import camera_line, recording_line
 from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
+from bayes3d_ros.cli.recording import NoRecording, mcap_option, recordings
+
+if TYPE_CHECKING:  # --help must be quick, --device must come before jax
+    from bayes3d_ros.io.bags import FrameReader
+    from bayes3d_ros.io.tracking_results import TrackWriter
+    from bayes3d_ros.ros.recording import TrackRecording
+    from bayes3d_ros.tracking.camera_estimate import CameraEstimate
+    from bayes3d_ros.tracking.session import CameraFollower
+    from bayes3d_ros.tracking.tracker import Tracking
 
 
 @click.command()
@@ -22,6 +31,7 @@ from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 @click.option("--hypotheses", type=int, help="Camera poses scored for every frame; default 1024.")
 @click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the tracker.")
+@mcap_option("camera_tracker")
 @table_frame_option
 @device_option
 def track(
@@ -32,6 +42,7 @@ def track(
     table_frame: str,
     world: Path | None,
     more: tuple[str, ...],
+    mcap: Path | None,
     **options: Any,
 ) -> None:
     """Follow the camera of BAG around what its first frame shows, or around a known world."""
@@ -40,13 +51,12 @@ def track(
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.parsing.parser import SceneParser
-    from bayes3d_ros.posterior.types import ParseError
     from bayes3d_ros.settings import TrackerSettings
-    from bayes3d_ros.tracking.camera_estimate import CameraEstimate, TrackingError
     from bayes3d_ros.tracking.session import CameraFollower
-    from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
+    from bayes3d_ros.tracking.tracker import CameraTracker
     from bayes3d_ros.tracking.world_file import load_world
 
+    writers = recordings(mcap, bag)
     settings = settings_from(TrackerSettings, more, options)
     models = load_library(library)
     frames = read_frames(bag, topic, table_frame)
@@ -57,26 +67,40 @@ def track(
     follower = CameraFollower(CameraTracker(models, settings), SceneParser(models), told)
     around = "what its first frame shows" if told is None else ", ".join(told.types)
     click.echo(f"following the camera around {around}")
-    known: Tracking | None = None
-    done: list[CameraEstimate] = []
-    recorded, failed = [], 0
-    with TrackWriter(out) as results:
-        for frame in progress(frames, len(frames), "frame"):
-            try:
-                with timed(f"first frame: {COMPILING}") if known is None else nullcontext():
-                    known, estimate = follower.step(known, frame)
-            except (TrackingError, ParseError) as error:
-                failed += 1
-                say(f"{bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
-                continue
-            results.write(estimate)
-            done.append(estimate)
-            recorded.append(frame.T_table_camera)
-            say(camera_line(estimate))
+    recording = writers.TrackRecording(mcap, table_frame) if writers else NoRecording()
+    with TrackWriter(out) as results, recording:
+        done, failed = _follow(frames, follower, results, recording)
     if not done:
         raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
-    lost = sum(bool(estimate.lost) for estimate in done)
+    estimates, recorded = zip(*done, strict=True)
+    lost = sum(bool(estimate.lost) for estimate in estimates)
     summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
     summary += f", {failed} could not be" if failed else ""
-    plot_track(done, out / PICTURE_FILE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
-    click.echo(f"{summary}; results in {out}")
+    plot_track(estimates, out / PICTURE_FILE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
+    click.echo(f"{summary}; results in {out}" + (f" and {mcap}" if mcap else ""))
+
+
+def _follow(
+    frames: "FrameReader", follower: "CameraFollower", results: "TrackWriter", recording: "TrackRecording | NoRecording"
+) -> tuple[list[tuple["CameraEstimate", Any]], int]:
+    """The camera of every frame that could be tracked, with its recorded pose, and how many frames could not be."""
+    from bayes3d_ros.posterior.types import ParseError
+    from bayes3d_ros.tracking.camera_estimate import TrackingError
+
+    known: Tracking | None = None
+    done: list[tuple[CameraEstimate, Any]] = []
+    failed = 0
+    for frame in progress(frames, len(frames), "frame"):
+        recording.frame(frame)
+        try:
+            with timed(f"first frame: {COMPILING}") if known is None else nullcontext():
+                known, estimate = follower.step(known, frame)
+        except (TrackingError, ParseError) as error:
+            failed += 1
+            say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
+            continue
+        results.write(estimate)
+        recording.camera(estimate)
+        done.append((estimate, frame.T_table_camera))
+        say(camera_line(estimate))
+    return done, failed

@@ -6,24 +6,21 @@ import errno
 import json
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def write_whole(
-    path: Path,
-    write: Callable[[BinaryIO], Any],
-    *,
-    mode: int | None = None,
-    replace: bool = True,
-    durable: bool = False,
-) -> None:
-    """Let `write` fill a temporary file, and give it the name `path`; if `durable`, return when both are on the disk.
+@contextmanager
+def whole_file(
+    path: Path, *, mode: int | None = None, replace: bool = True, durable: bool = False
+) -> Iterator[BinaryIO]:
+    """A temporary file to fill, which gets the name `path` at the end; if `durable`, both are on the disk then.
 
-    The temporary file is `.NAME-*.tmp` in the same folder. It goes away if `write` fails, and stays only if the process
-    is killed (`remove_leftovers`). `mode` is that of the file; by default what the umask leaves. Raises OSError; unless
-    `replace`, FileExistsError where `path` exists, also if another process has just written it.
+    The temporary file is `.NAME-*.tmp` in the same folder. It goes away if an error ends the block, and stays only if
+    the process is killed (`remove_leftovers`). `mode` is that of the file; by default what the umask leaves. Raises
+    OSError; unless `replace`, FileExistsError where `path` exists, also if another process has just written it.
     """
     temporary = path.with_name(f".{path.name}-{secrets.token_hex(8)}.tmp")
     try:
@@ -32,7 +29,7 @@ def write_whole(
         raise OSError(error.errno, error.strerror, str(path)) from None
     try:
         with os.fdopen(handle, "w+b") as file:
-            write(file)
+            yield file
             file.flush()
             if mode is not None:
                 os.fchmod(handle, mode)
@@ -46,6 +43,19 @@ def write_whole(
             _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_whole(
+    path: Path,
+    write: Callable[[BinaryIO], Any],
+    *,
+    mode: int | None = None,
+    replace: bool = True,
+    durable: bool = False,
+) -> None:
+    """Let `write` fill a file that gets the name `path` when it is whole; options and errors are `whole_file`'s."""
+    with whole_file(path, mode=mode, replace=replace, durable=durable) as file:
+        write(file)
 
 
 def write_json(path: Path, content: Any) -> None:

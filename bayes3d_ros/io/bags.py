@@ -9,24 +9,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth, encode_compressed_depth
+from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.depth_image import decode_depth, encode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
 from bayes3d_ros.io.bag_contents import (
-    CAMERA_INFO,
     COMPRESSED_IMAGE,
-    IMAGE,
-    POSE,
     STORE,
     decode,
     read_contents,
     stamp_ns,
 )
-from bayes3d_ros.io.bag_topics import COMPRESSED_DEPTH, choose_depth_topic, choose_info_topic
+from bayes3d_ros.io.bag_topics import choose_depth_topic, choose_info_topic
 from bayes3d_ros.io.camera_poses import camera_poses
+from bayes3d_ros.io.frame_messages import TABLE_FRAME, frame_messages, frame_topics
 from bayes3d_ros.io.mcap_files import BagDamage, BagError, RawMessage, Topic, raw_messages, topics
 
 __all__ = [
@@ -40,9 +37,6 @@ __all__ = [
     "read_frames",
     "topics",
 ]
-
-DEPTH_TOPIC, INFO_TOPIC, POSE_TOPIC = "/depth/image_rect", "/depth/camera_info", "/camera_pose"
-TABLE_FRAME = "table"
 
 
 def read_frames(bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME) -> "FrameReader":
@@ -135,15 +129,13 @@ class BagWriter:
     def __init__(self, path: Path, encoding: str = "16UC1") -> None:
         if path.exists():
             raise BagError(f"{path}: expected a new folder to write the bag to, it exists already")
-        self._encoding, self._compressed = encoding, ";" in encoding
-        self._depth_topic = DEPTH_TOPIC + COMPRESSED_DEPTH if self._compressed else DEPTH_TOPIC
+        self._encoding = encoding
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
     def __enter__(self) -> "BagWriter":
         self._writer.open()
-        types = {INFO_TOPIC: CAMERA_INFO, POSE_TOPIC: POSE}
-        types[self._depth_topic] = COMPRESSED_IMAGE if self._compressed else IMAGE
+        types = frame_topics(self._encoding)
         self._connections = {t: self._writer.add_connection(t, m, typestore=STORE) for t, m in types.items()}
         return self
 
@@ -152,32 +144,8 @@ class BagWriter:
 
     def write(self, frame: DepthFrame) -> None:
         """Append a frame."""
-        types, i = STORE.types, frame.intrinsics
-        stamp = types["builtin_interfaces/msg/Time"](*divmod(frame.stamp_ns, 10**9))
-        header = types["std_msgs/msg/Header"](stamp, frame.frame_id)
-        k = np.array([i.fx, 0, i.cx, 0, i.fy, i.cy, 0, 0, 1])
-        p = np.array([i.fx, 0, i.cx, 0, 0, i.fy, i.cy, 0, 0, 0, 1, 0])
-        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        info = types[CAMERA_INFO](
-            header, i.height, i.width, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), p, 0, 0, roi
-        )
-        self._append(INFO_TOPIC, info, frame.stamp_ns)
-        if frame.T_table_camera is not None:
-            position = types["geometry_msgs/msg/Point"](*frame.T_table_camera[:3, 3].tolist())
-            quaternion = Rotation.from_matrix(frame.T_table_camera[:3, :3]).as_quat().tolist()
-            pose = types["geometry_msgs/msg/Pose"](position, types["geometry_msgs/msg/Quaternion"](*quaternion))
-            self._append(
-                POSE_TOPIC, types[POSE](types["std_msgs/msg/Header"](stamp, TABLE_FRAME), pose), frame.stamp_ns
-            )
-        self._append(self._depth_topic, self._image(frame.depth, header), frame.stamp_ns)
-
-    def _image(self, depth: Float[np.ndarray, "height width"], header: Any) -> Any:
-        if self._compressed:
-            data = np.frombuffer(encode_compressed_depth(depth, self._encoding), np.uint8)
-            return STORE.types[COMPRESSED_IMAGE](header, self._encoding, data)
-        height, width = depth.shape
-        data = np.frombuffer(encode_depth(depth, self._encoding), np.uint8)
-        return STORE.types[IMAGE](header, height, width, self._encoding, 0, len(data) // height, data)
+        for topic, _, message in frame_messages(frame, self._encoding):
+            self._append(topic, message, frame.stamp_ns)
 
     def _append(self, topic: str, message: Any, t_ns: int) -> None:
         connection = self._connections[topic]

@@ -5,14 +5,13 @@
 import contextlib
 import sys
 import time
-from collections import deque
 from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import jax
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -23,6 +22,7 @@ from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
+from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
@@ -33,7 +33,7 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.qos import RELIABLE
 from bayes3d_ros.ros.spinning import run_node
-from bayes3d_ros.ros.to_messages import camera_particles, camera_pose_message, path_pose
+from bayes3d_ros.ros.to_messages import camera_particles, camera_pose_message
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.session import CameraFollower
@@ -83,7 +83,7 @@ class CameraTrackerNode(Node):
         self._session: _Session | None = None
         self._known: Tracking | None = None  # the worker's own
         self._told = ""
-        self._path: deque[PoseStamped] = deque(maxlen=self._node_settings().path_length)
+        self._path = CameraPath(self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", RELIABLE)
         self._particles = self.create_publisher(PoseArray, "~/particles", RELIABLE)
         self._trail = self.create_publisher(PathMessage, "~/path", RELIABLE)
@@ -158,9 +158,9 @@ class CameraTrackerNode(Node):
         world = settings.table_frame
         self._pose.publish(camera_pose_message(estimate, world))
         self._particles.publish(camera_particles(estimate, world, settings.most_particles))
-        self._path.append(path_pose(estimate, world))
+        self._path.add(estimate, world)
         if self._trail.get_subscription_count():  # grows with every frame
-            self._trail.publish(PathMessage(header=self._path[-1].header, poses=list(self._path)))
+            self._trail.publish(self._path.message())
         self._parts.health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
 
     def _working(self, follower: Follower, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
@@ -184,7 +184,7 @@ class CameraTrackerNode(Node):
         if names & DEPTH_INPUT_PARAMETERS:
             self._listen()
         if "path_length" in names:
-            self._path = deque(self._path, self._node_settings().path_length)
+            self._path.keep(self._node_settings().path_length)
         if names & _TRACKER_PARAMETERS:
             self._begin()
 

@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter
 from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.depth_transport import RAW, TRANSPORTS
 from bayes3d_ros.ros.from_messages import matrix_from_values
+from bayes3d_ros.ros.planning_scene import why_not
 from bayes3d_ros.settings import (
     RETIRED,
     LearnerSettings,
@@ -106,6 +107,11 @@ class SceneParserNodeSettings(DepthInputSettings):
     publish_tf: bool = setting(
         False, "send the pose of every object to tf, as the frame NODE/ID below the frame of the poses; needs tf2_ros"
     )
+    planning_scene: bool = setting(
+        False,
+        "tell a motion planner of the objects on ~/planning_scene, in output_frame, which must stand still; needs "
+        "moveit_msgs",
+    )
     autostart: bool = setting(True, "configure and activate when the node starts; false: wait for a lifecycle manager")
     warm_up_width: int = setting(
         640,
@@ -125,6 +131,8 @@ class SceneParserNodeSettings(DepthInputSettings):
         sigma = self.camera_pose_sigma
         if len(sigma) != 2 or not all(0.0 <= value <= 1.0 for value in sigma):
             raise ValueError(f"camera_pose_sigma must be two numbers in [0, 1], m and rad, got {list(sigma)}")
+        if self.planning_scene and (problem := why_not(self.output_frame)):
+            raise ValueError(f"planning_scene {problem}")
 
 
 @dataclass(frozen=True)
@@ -178,6 +186,7 @@ OUTPUT_FRAME_PARAMETERS = (
     "output_frame",
     "camera_pose_sigma",
     "publish_tf",
+    "planning_scene",
 )  # likewise, and inputs stay open meanwhile
 FIXED_WHILE_ACTIVE = ("autostart", "qos_reliability", "depth_transport", "table_frame", "patience")
 

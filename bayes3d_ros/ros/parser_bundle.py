@@ -11,6 +11,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library, type_names
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.markers import SceneMarkers
+from bayes3d_ros.ros.planning_scene import CollisionMeshes
 from bayes3d_ros.settings import ParserSettings
 
 
@@ -31,10 +32,11 @@ MakeParser = Callable[[Library, ParserSettings], Parser]
 
 
 class ParserBundle(NamedTuple):
-    """A compiled parser, markers for its library, and the name of JAX's backend."""
+    """A compiled parser, markers and meshes for its library, and the name of JAX's backend."""
 
     parser: Parser
     markers: SceneMarkers
+    meshes: CollisionMeshes
     backend: str
 
 
@@ -50,4 +52,4 @@ def make_bundle(
     parser = make_parser(library, settings)
     if all(size):
         parser.warm_up(*size)
-    return ParserBundle(parser, SceneMarkers(library), jax.default_backend())
+    return ParserBundle(parser, SceneMarkers(library), CollisionMeshes(library), jax.default_backend())

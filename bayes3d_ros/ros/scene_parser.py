@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import Library, LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.collision_scene import check_frame
 from bayes3d_ros.posterior.object_ids import IdMemory, named
 from bayes3d_ros.posterior.reframe import in_frame
 from bayes3d_ros.posterior.types import ParseError
@@ -30,7 +31,9 @@ from bayes3d_ros.ros.parameters import (
     SceneParserNodeSettings,
 )
 from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle, types_of
+from bayes3d_ros.ros.planning_scene import PlanningScenePublisher
 from bayes3d_ros.ros.publishers import ScenePublishers
+from bayes3d_ros.ros.scene_outputs import ToldScene
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
 
@@ -60,6 +63,7 @@ class SceneParserNode(Node):
         self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
         self._frames: OutputFrames | None = None  # there while inputs are; likewise
         self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
+        self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
         self._ids = IdMemory()  # the worker's alone
         self._preparing_since: float | None = None
         self._requests = 0
@@ -204,6 +208,7 @@ class SceneParserNode(Node):
         settings = self._parts.settings.in_use(SceneParserNodeSettings)
         self._frames = OutputFrames(self, settings)
         self._transforms = ObjectTransforms(self) if settings.publish_tf else None
+        self._planning = PlanningScenePublisher(self) if settings.planning_scene else None
 
     def _close_frames(self) -> None:
         if self._frames is not None:
@@ -212,6 +217,9 @@ class SceneParserNode(Node):
         if self._transforms is not None:
             self._transforms.close()
             self._transforms = None
+        if self._planning is not None:
+            self._planning.close()
+            self._planning = None
 
     def _why_fixed(self, names: list[str]) -> str:
         fixed = [name for name in names if name in FIXED_WHILE_ACTIVE]
@@ -232,7 +240,7 @@ class SceneParserNode(Node):
     def _process(self, messages: DepthMessages) -> None:
         """On the worker's thread: one frame from messages to messages."""
         ready, health = self._ready, self._parts.health
-        frames, transforms = self._frames, self._transforms
+        frames, transforms, planning = self._frames, self._transforms, self._planning
         if ready is None or frames is None:
             health.discard()
             return
@@ -242,6 +250,8 @@ class SceneParserNode(Node):
             with health.doing("parsing one frame", usual=QUIET):
                 posterior = ready.parser.parse(frame)
             told = in_frame(posterior, frames.find(posterior, messages.pose, messages.arrived))
+            if planning is not None:
+                check_frame(told)
         except (ValueError, ParseError) as error:
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             self._parts.problem(str(error), why)
@@ -249,7 +259,9 @@ class SceneParserNode(Node):
         ids, self._ids = named(self._ids, told)
         if transforms is not None:  # before messages that name the ids
             transforms.send(told, ids)
-        self._outputs.scene(told, ids, ready, frames.table_frame)
+        if planning is not None:
+            planning.send(told, ids, ready.meshes)
+        self._outputs.scene(ToldScene(told, ids, ready.parser.library, ready.markers, frames.table_frame))
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
 

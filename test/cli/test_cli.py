@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 from bayes3d_ros.cli import main, progress
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
-from bayes3d_ros.io.bags import BagWriter, read_frames
+from bayes3d_ros.io.bags import BagWriter, read_frames, topics
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.store import load_library, save_model
 from bayes3d_ros.parsing import parser
@@ -502,3 +502,43 @@ def test_track_goes_on_after_a_frame_that_fails_and_fails_if_all_do(bag, library
     assert_one_line(
         run("track", bag, "--library", library, "--out", tmp_path / "o", "--hypotheses", 9), 2, "hypotheses"
     )
+
+
+@pytest.mark.parametrize("command", ["parse", "track"])
+def test_mcap_writes_what_the_node_would_publish(bag, library, followers, tmp_path, command):
+    pytest.importorskip("rclpy")
+    file = tmp_path / "new" / "told.mcap"
+    result = run(command, bag, "--library", library, "--out", tmp_path / "out", "--mcap", file, "--table-frame", "desk")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.endswith(f"; results in {tmp_path / 'out'} and {file}\n")
+    assert [frame.stamp_ns for frame in read_frames(file)] == [1, 2, 3]
+    name = {"parse": "/scene_parser/poses", "track": "/camera_tracker/camera_pose"}[command]
+    told = topics(file)
+    assert told[name].count == told["/tf"].count == 3
+
+
+def test_mcap_without_ros_or_with_a_wrong_name_is_one_line_before_anything_is_read(
+    bag, library, followers, tmp_path, monkeypatch
+):
+    out = ("--library", library, "--out", tmp_path / "out", "--mcap")
+    (inside,) = bag.glob("*.mcap")
+    for command in ("parse", "track"):
+        assert_one_line(run(command, bag, *out, tmp_path / "told.bag"), 2, "told.bag", "ends in .mcap")
+        assert_one_line(run(command, bag, *out, inside), 2, inside, "no part of the bag")
+        assert_one_line(run(command, inside, *out, inside), 2, inside, "no part of the bag")
+    monkeypatch.setitem(sys.modules, "bayes3d_ros.ros.recording", None)
+    monkeypatch.delattr("bayes3d_ros.ros.recording", raising=False)
+    for command in ("parse", "track"):
+        told = run(command, bag, *out, tmp_path / "told.mcap")
+        assert_one_line(told, 2, "--mcap needs ROS 2's message packages", "pip install 'bayes3d_ros[ros]'")
+        assert not told.stdout
+    assert not (tmp_path / "out").exists() and not (tmp_path / "told.mcap").exists()
+
+
+def test_a_place_that_an_mcap_cannot_be_written_to_is_named(bag, library, parsers, tmp_path):
+    pytest.importorskip("rclpy")
+    (tmp_path / "file").write_text("")
+    file = tmp_path / "file" / "told.mcap"
+    told = run("parse", bag, "--library", library, "--out", tmp_path / "out", "--mcap", file)
+    assert_one_line(told, 2, tmp_path / "file")
+    assert "compiling" not in told.stdout

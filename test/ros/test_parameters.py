@@ -104,6 +104,8 @@ def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, Sett
         with_values("camera_pose_sigma:=[0.001, -0.1]"),
         with_values("camera_pose_sigma:=[.nan, 0.0]"),
         with_values("output_frame:=3"),
+        with_values("planning_scene:=true"),
+        with_values("planning_scene:=yes, please"),
         with_values("qos_reliability:=perhaps"),
         with_values("depth_transport:=theora"),
         with_values("autostart:=3"),
