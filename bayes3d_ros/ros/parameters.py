@@ -31,6 +31,7 @@ from bayes3d_ros.settings import (
 )
 
 Settings = TypeVar("Settings")
+CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser
 # What rclpy, or a part of it, may declare later, or not in every version.
 _STANDARD_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 _STANDARD_PREFIXES = ("qos_overrides.",)
@@ -101,6 +102,14 @@ class SceneParserNodeSettings(DepthInputSettings):
     )
     publish_tf: bool = setting(
         False, "send the transform of every object to tf, from the frame of the poses to NODE/ID; needs tf2_ros"
+    )
+    mode: str = setting(
+        CONTINUOUS,
+        "when images are parsed: continuous, the newest image always; on_request, an image for each call of ~/parse",
+        choices=(CONTINUOUS, ON_REQUEST),
+    )
+    parse_timeout: float = setting(
+        10.0, "how long a call of ~/parse waits for its result", unit="s", low=0.1, high=3600.0
     )
     autostart: bool = setting(True, "configure and activate at the start; otherwise wait for a lifecycle manager")
     warm_up_width: int = setting(640, "width of the images to compile for before the first one", unit="px", low=0)
