@@ -22,7 +22,7 @@ from bayes3d_ros.jax_runtime import enable_cache
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
-from bayes3d_ros.ros.diagnostics import Health, InputView, judge, one_line
+from bayes3d_ros.ros.diagnostics import Health, InputView, judge, judge_on_request, one_line
 from bayes3d_ros.ros.parameters import DepthInputSettings, SettingsParameters
 from bayes3d_ros.ros.worker import NewestWorker
 
@@ -139,11 +139,12 @@ class InferenceParts(DepthNodeParts):
         self.refusal = why
         self._node.get_logger().error(f"{why}; correct it, then {self._remedy}")
 
-    def problem(self, what: str, why: str = "") -> None:
-        """A frame gave no output. One line of a kind `what` is enough in the log."""
+    def problem(self, what: str, why: str = "") -> str:
+        """A frame gave no output; the line that says so. One of a kind `what` is enough in the log."""
         text = f"{what} ({why})" if why else what
         if self.health.problem(text, kind=what):
             self._node.get_logger().warning(f"no output: {text}")
+        return text
 
     def failure(self, what: str, error: Exception) -> str:
         """One line about an exception; its traceback goes to the log at the level debug."""
@@ -153,6 +154,10 @@ class InferenceParts(DepthNodeParts):
     def judge(self, view: InputView, good: str) -> tuple[bytes, str]:
         """The level and the one line that says whether there is output, and if not, why; see diagnostics.judge."""
         return judge(self.health, view, idle=self.worker.idle, good=good)
+
+    def judge_on_request(self, view: InputView) -> tuple[bytes, str]:
+        """The same of a node that works on request; see diagnostics.judge_on_request."""
+        return judge_on_request(self.health, view, idle=self.worker.idle)
 
     def health_report(self, job: str, told: tuple[bytes, str], state: str, view: InputView | None) -> DiagnosticArray:
         """The message for /diagnostics of a node that does a `job`. `told`: level and line."""

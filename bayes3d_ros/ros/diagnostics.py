@@ -132,7 +132,7 @@ class Health:
         self._latency, self._seconds, self._ess = 0.0, 0.0, ""
         self._warnings: tuple[str, ...] = ()
         self._usable_share = math.nan
-        self.parsed, self.refused, self.discarded = 0, 0, 0
+        self.parsed, self.refused, self.discarded, self.unasked = 0, 0, 0, 0
         self.backend = ""
 
     def begin(self) -> None:
@@ -154,6 +154,11 @@ class Health:
         """Note a frame that came too late to be worked on: the node is inactive, or being set up anew."""
         with self._lock:
             self.discarded += 1
+
+    def pass_over(self) -> None:
+        """Note a frame that nobody asked for."""
+        with self._lock:
+            self.unasked += 1
 
     def output(
         self,
@@ -183,17 +188,28 @@ class Health:
             with self._lock:
                 self._doing = None
 
+    def work(self, least: float | None = None) -> str:
+        """What has been done for `least` seconds, or for longer than is usual, in one line; empty where nothing has."""
+        with self._lock:
+            if self._doing is None:
+                return ""
+            what, since, usual = self._doing
+            taken = time.monotonic() - since
+            return f"{what}, {taken:.0f} s so far" if taken >= (usual if least is None else least) else ""
+
+    def failure(self) -> str:
+        """Why the last frame gave no output; empty where it gave one."""
+        with self._lock:
+            newest = self._outputs[-1] if self._outputs else None
+            return self._problem if newest is None or newest < self._problem_at else ""
+
     def why_silent(self, view: InputView) -> str:
         """Why images come in and nothing goes out, in one line; empty where outputs come."""
+        if told := self.work() or self.failure():
+            return told
         with self._lock:
             now = time.monotonic()
-            if self._doing is not None:
-                what, since, usual = self._doing
-                if now - since >= usual:
-                    return f"{what}, {now - since:.0f} s so far"
             newest = self._outputs[-1] if self._outputs else None
-            if self._problem and (newest is None or newest < self._problem_at):
-                return self._problem
             if newest is not None and now - newest < max(QUIET, 3 * self._seconds):
                 return ""
             since, when = (self._began, "yet") if newest is None else (newest, "any more")
@@ -220,7 +236,8 @@ class Health:
                 parsed=str(self.parsed),
                 refused=str(self.refused),
                 dropped=str(dropped),
-                waiting=str(received - self.parsed - self.refused - dropped),
+                unasked=str(self.unasked),
+                waiting=str(received - self.parsed - self.refused - dropped - self.unasked),
                 camera_pose="" if view is None else view.pose_source,
                 usable_share="" if math.isnan(self._usable_share) else f"{self._usable_share:.2f}",
                 backend=self.backend,
@@ -248,6 +265,19 @@ def judge(health: Health, view: InputView, *, idle: bool, good: str) -> tuple[by
         return WARN, silent
     told = [*input_warnings(view), *health.warnings()]
     return (WARN, f"{good}; {'; '.join(told)}") if told else (OK, good)
+
+
+def judge_on_request(health: Health, view: InputView, *, idle: bool) -> tuple[bytes, str]:
+    """The same of a node that parses on request: while nobody asks, complete images are all that is expected. `idle`:
+    no frame is being worked on."""
+    if told := health.work() or why_no_input(view):
+        return WARN, told
+    if not view.delivering:
+        return WARN, f"no image for a request: {where_images_are(view)}"
+    good = "waiting for a request (~/parse)" if idle else "parsing on request"
+    failure = health.failure()
+    told_of = [*input_warnings(view), *([f"the last request had no result: {failure}"] if failure else [])]
+    return (WARN, f"{good}; {'; '.join(told_of)}") if told_of else (OK, good)
 
 
 def diagnostic_array(status: DiagnosticStatus) -> DiagnosticArray:

@@ -32,6 +32,7 @@ from bayes3d_ros.settings import (
 )
 
 Settings = TypeVar("Settings")
+CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser
 # What rclpy, or a part of it, may declare later, or not in every version.
 _STANDARD_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 _STANDARD_PREFIXES = ("qos_overrides.",)
@@ -111,6 +112,14 @@ class SceneParserNodeSettings(DepthInputSettings):
         False,
         "tell a motion planner of the objects on ~/planning_scene, in output_frame, which must stand still; needs "
         "moveit_msgs",
+    )
+    mode: str = setting(
+        CONTINUOUS,
+        "when images are parsed: continuous, the newest image always; on_request, an image for each call of ~/parse",
+        choices=(CONTINUOUS, ON_REQUEST),
+    )
+    parse_timeout: float = setting(
+        10.0, "how long a call of ~/parse waits for its result", unit="s", low=0.1, high=3600.0
     )
     autostart: bool = setting(True, "configure and activate when the node starts; false: wait for a lifecycle manager")
     warm_up_width: int = setting(

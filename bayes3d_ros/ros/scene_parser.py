@@ -20,21 +20,25 @@ from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
-from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView
+from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView, one_line
 from bayes3d_ros.ros.object_transforms import ObjectTransforms
 from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parameters import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
+    ON_REQUEST,
     OUTPUT_FRAME_PARAMETERS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
+from bayes3d_ros.ros.parse_requests import ParseAnswer
+from bayes3d_ros.ros.parse_service import ParseService
 from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle, types_of
 from bayes3d_ros.ros.planning_scene import PlanningScenePublisher
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.scene_outputs import ToldScene
 from bayes3d_ros.ros.spinning import run_node
+from bayes3d_ros.ros.summary import found_words, key_values
 from bayes3d_ros.settings import ParserSettings
 
 _PARSER_PARAMETERS = {f.name for f in fields(ParserSettings)}
@@ -68,6 +72,7 @@ class SceneParserNode(Node):
         self._preparing_since: float | None = None
         self._requests = 0
         self._outputs = ScenePublishers(self)
+        self._parse = ParseService(self, self._parse_timeout, self._why_not, self._why_late)
         self._prepared = self.create_guard_condition(self._on_prepared)
         self.create_service(Trigger, "~/reload_library", self._on_reload)
         if self.get_parameter("autostart").value:
@@ -102,6 +107,7 @@ class SceneParserNode(Node):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening."""
         self._close_inputs()
+        self._parse.refuse_all("the node was deactivated")
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -114,6 +120,7 @@ class SceneParserNode(Node):
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening, for good."""
         self._close_inputs()
+        self._parse.refuse_all("the node was shut down")
         return super().on_shutdown(state)
 
     def stop(self, timeout: float) -> bool:
@@ -195,7 +202,7 @@ class SceneParserNode(Node):
     def _open_inputs(self) -> None:
         use_pose = {"depth": "no", "auto": "yes", "pose": "required"}[self._parts.settings.read(ParserSettings).table]
         self._open_frames()
-        self._parts.listen(self._parts.worker.submit, use_pose)
+        self._parts.listen(self._on_image, use_pose)
         self._parts.health.begin()
 
     def _close_inputs(self) -> None:
@@ -226,6 +233,8 @@ class SceneParserNode(Node):
         return f"{fixed[0]}: deactivate the node first" if fixed and self._parts.inputs is not None else ""
 
     def _parameters_changed(self, names: set[str]) -> None:
+        if "mode" in names:
+            self._parts.health.begin()
         begun = self._ready is not None or self._preparing_since is not None
         if begun and names & _PARSER_PARAMETERS:
             self._prepare()
@@ -237,13 +246,34 @@ class SceneParserNode(Node):
 
     # Frames
 
+    @property
+    def _on_request(self) -> bool:
+        return self.get_parameter("mode").value == ON_REQUEST
+
+    def _on_image(self, messages: DepthMessages) -> None:
+        """A complete image: for the worker, unless nobody asked for it."""
+        if self._on_request and not self._parse.requests.want(messages.arrived):
+            self._parts.health.pass_over()
+        else:
+            self._parts.worker.submit(messages)
+
     def _process(self, messages: DepthMessages) -> None:
-        """On the worker's thread: one frame from messages to messages."""
+        """On the worker's thread: one frame, and the answer to whoever asked for it."""
+        asked = self._parse.requests.take(messages.arrived)
+        try:
+            answer = self._parse_and_publish(messages)
+        except Exception as error:
+            self._parse.answer(asked, ParseAnswer(False, f"internal error, please report it: {one_line(error)}"))
+            raise
+        self._parse.answer(asked, answer)
+
+    def _parse_and_publish(self, messages: DepthMessages) -> ParseAnswer:
+        """One frame from messages to messages, and what is told of it in one line."""
         ready, health = self._ready, self._parts.health
         frames, transforms, planning = self._frames, self._transforms, self._planning
         if ready is None or frames is None:
             health.discard()
-            return
+            return ParseAnswer(False, "the node was deactivated")
         try:
             frame = messages.frame()
             self._compile_for(frame, ready)
@@ -254,8 +284,7 @@ class SceneParserNode(Node):
                 check_frame(told)
         except (ValueError, ParseError) as error:
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
-            self._parts.problem(str(error), why)
-            return
+            return ParseAnswer(False, self._parts.problem(str(error), why))
         ids, self._ids = named(self._ids, told)
         if transforms is not None:  # before messages that name the ids
             transforms.send(told, ids)
@@ -264,6 +293,7 @@ class SceneParserNode(Node):
         self._outputs.scene(ToldScene(told, ids, ready.parser.library, ready.markers, frames.table_frame))
         latency = time.monotonic() - messages.arrived
         health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
+        return ParseAnswer(True, found_words(told, ids))
 
     def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:
         """Compile for images of a frame's size, where that is needed, and say so."""
@@ -272,6 +302,21 @@ class SceneParserNode(Node):
             self.get_logger().info(f"compiling for images of {width}x{height}; a minute or so the first time")
             with self._parts.health.doing(f"compiling for images of {width}x{height}"):
                 ready.parser.warm_up(width, height)
+
+    # Requests
+
+    def _parse_timeout(self) -> float:
+        return self._parts.settings.in_use(SceneParserNodeSettings).parse_timeout
+
+    def _why_not(self) -> str:
+        """Why no image is listened to; empty where images are."""
+        return self._why(None)[1] if self._parts.inputs is None else ""
+
+    def _why_late(self) -> str:
+        """Why a call has no result yet."""
+        work = self._parts.health.work(least=0.0)
+        why = f"busy, {work}" if work else self._why(self._view())[1]
+        return f"no result within {self._parse_timeout():g} s: {why}"
 
     # Diagnostics
 
@@ -282,7 +327,9 @@ class SceneParserNode(Node):
         view = self._view()
         if self._ready is not None:
             self._parts.health.backend = self._ready.backend
-        return self._parts.health_report("scene parsing", self._why(view), self._state_label(), view)
+        report = self._parts.health_report("scene parsing", self._why(view), self._state_label(), view)
+        report.status[0].values += key_values(requests=str(self._parse.requests.count))
+        return report
 
     def _view(self) -> InputView | None:
         """What is seen of the inputs. Without any pose the parser finds the table in the depth image, if it may."""
@@ -300,7 +347,7 @@ class SceneParserNode(Node):
             return WARN, f"compiling for the library, {time.monotonic() - self._preparing_since:.0f} s so far"
         if view is None:
             return WARN, f"the node is {self._state_label()}; configure and activate it"
-        return self._parts.judge(view, good="parsing")
+        return self._parts.judge_on_request(view) if self._on_request else self._parts.judge(view, good="parsing")
 
 
 def main(args: list[str] | None = None) -> int:

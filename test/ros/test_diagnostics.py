@@ -5,8 +5,19 @@
 import pytest
 
 from bayes3d_ros.ros import diagnostics
-from bayes3d_ros.ros.diagnostics import OK, WARN, Health, InputView, LogThrottle, TopicView, judge, why_no_input
+from bayes3d_ros.ros.diagnostics import (
+    OK,
+    WARN,
+    Health,
+    InputView,
+    LogThrottle,
+    TopicView,
+    judge,
+    judge_on_request,
+    why_no_input,
+)
 
+KEYS = ("received", "parsed", "refused", "dropped", "unasked", "waiting")
 DEPTH, INFO = "/rig/depth", "/rig/info"
 
 
@@ -79,6 +90,32 @@ def test_it_is_ok_only_while_outputs_come(clock: list[float]) -> None:
         assert told(view()) == (WARN, "parsing one frame, 4 s so far")
 
 
+def test_on_request_it_is_ok_to_wait_only_while_complete_images_come(clock: list[float]) -> None:
+    health = Health()
+
+    def told(seen: InputView, idle: bool = True) -> tuple[bytes, str]:
+        return judge_on_request(health, seen, idle=idle)
+
+    clock[0] += 100
+    assert told(view()) == (OK, "waiting for a request (~/parse)")
+    assert told(view(), idle=False) == (OK, "parsing on request")
+    for idle in (True, False):
+        assert told(view(9.0), idle) == (WARN, f"no message on {DEPTH} for 9 s")
+        stuck = view(waiting=1, delivered_age=9.0, pose_topic="/pose")
+        where = f"1 image waits for CameraInfo of their stamp on {INFO}, or the camera's pose (/pose, tf)"
+        assert told(stuck, idle) == (WARN, f"no image for a request: {where}")
+    assert told(view(pose_problem="late")) == (WARN, "waiting for a request (~/parse); no camera pose: late")
+    health.problem("no table in sight")
+    failed = "waiting for a request (~/parse); the last request had no result: no table in sight"
+    assert told(view()) == (WARN, failed)
+    clock[0] += 1
+    health.output(0.1, [1.0], 0.2)
+    assert told(view()) == (OK, "waiting for a request (~/parse)")
+    with health.doing("compiling for images of 848x480"):
+        clock[0] += 12
+        assert told(view(), idle=False) == (WARN, "compiling for images of 848x480, 12 s so far")
+
+
 def test_what_is_wrong_beside_an_output_is_a_warning() -> None:
     health = Health()
     health.output(0.1, [1.0], 0.2)
@@ -106,6 +143,7 @@ def test_every_image_is_accounted_for() -> None:
         health.output(0.1, [1.0], 0.2)
     health.problem("no table")
     health.discard()
+    health.pass_over()
     report = health.report("n", OK, "m", state="s", received=12, dropped=5, view=None)
     values = {pair.key: pair.value for pair in report.status[0].values}
-    assert [values[k] for k in ("received", "parsed", "refused", "dropped", "waiting")] == ["12", "3", "1", "6", "2"]
+    assert [values[k] for k in KEYS] == ["12", "3", "1", "6", "1", "1"]
