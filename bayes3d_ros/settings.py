@@ -199,11 +199,12 @@ class ParserSettings:
         high=3.0,
     )
     outline_sigma: float = setting(
-        0.13,
-        "standard deviation of the sideways displacement of an object's whole outline, in pixels of the reduced image",
-        unit="scored px",
+        0.00085,
+        "standard deviation of the angle by which the camera displaces the outline of an object in the image, along "
+        "either axis; about half a pixel of a camera with 640 columns",
+        unit="rad",
         low=0.0,
-        high=3.0,
+        high=0.02,
     )
     image_bias: float = setting(
         0.001, "standard deviation of a constant depth error of the whole image", unit="m", low=0.0, high=0.05

@@ -239,8 +239,7 @@ class SceneParser:
             reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
             if not reached or (not settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
-        image = seen.image
-        outline = settings.outline_sigma / float(image.focal[0]) if settings.shares_errors else 0.0
+        outline = settings.outline_sigma if settings.shares_errors else 0.0
         return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline)
 
     def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):
