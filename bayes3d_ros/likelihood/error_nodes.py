@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from scipy import ndimage
 
 from bayes3d_ros.likelihood.density import Noise
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -104,6 +105,8 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
         weight = share * cells.precision / sigma**2
         told = weight.sum(1)
         offset, variance = (weight * cells.residual).sum(1) / (told + tie), 1 / (told + tie)
+        tied = 1 - variance * tie  # the share of each cell's offset that its returns settle
+        of_table = 2 * np.square(tied).sum() + AMPLITUDE_LOG_SD**-2
         inliers, returns = share.sum(), cells.real.sum()
         square = np.square(cells.residual - offset[:, None]) + variance[:, None]
         mean[0] = 0.5 * np.log((share * cells.precision * square).sum() / inliers)
@@ -112,15 +115,13 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
             # A step of Newton's on the log posterior of log tau, whose information the offsets' own is not part of.
             excess = np.exp(-2 * mean[2]) * (offset**2 + variance).sum()
             pull = excess - len(offset) - (mean[2] - prior[2]) / AMPLITUDE_LOG_SD**2
-            information = 2 * np.square(1 - variance * tie).sum() + AMPLITUDE_LOG_SD**-2
-            mean[2] += np.clip(pull / information, -0.5, 0.5)
+            mean[2] += np.clip(pull / of_table, -0.5, 0.5)
         mean = np.clip(mean, least, np.log([sigma_max, 1e5, 1.0]))
     # Louis' formula (1982): of complete data, less the variance of what is not known, namely which are outliers.
     unsure = share * (1 - share)
-    tied = 1 - variance * tie  # the share of each cell's offset that its returns settle
     of_sigma = 2 * (inliers - tied.sum()) - (unsure * np.square(off2 - 1)).sum()
     of_p = (returns - inliers) * inliers / returns - unsure.sum()
-    information = [of_sigma, max(of_p, 1.0), 2 * (tied**2).sum() + AMPLITUDE_LOG_SD**-2]
+    information = [of_sigma, max(of_p, 1.0), of_table]
     return TableErrors(mean, np.minimum(np.maximum(information, 1e-9) ** -0.5, _WIDEST))
 
 
@@ -148,11 +149,7 @@ def _table_cells(image: ScoredImage, inside, spread, block: int) -> _TableCells:
 
 def _grown(which: Bool[np.ndarray, "H W"], by: int) -> Bool[np.ndarray, "H W"]:
     """These pixels, and those within so many rows and columns of them."""
-    for axis in (0, 1):
-        padded = np.pad(which, [(by, by) if axis == a else (0, 0) for a in (0, 1)])
-        size = which.shape[axis]
-        which = np.any([np.take(padded, np.arange(k, k + size), axis) for k in range(2 * by + 1)], axis=0)
-    return which
+    return ndimage.maximum_filter(which, 2 * by + 1, mode="constant", cval=False)
 
 
 def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S TA"]) -> Noise:
@@ -162,8 +159,8 @@ def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Arr
     of_sigma, of_p = (jax.nn.logsumexp(log_mass, axis) for axis in (2, 1))
     moved = jnp.stack([0.5 * (a[:, 1] - a[:, 0]) for a in (of_sigma, of_p)], -1)
     normal = jnp.clip(moved, -_MOST_SDS, _MOST_SDS) + jax.random.normal(key, moved.shape)
-    log_sigma = jnp.log(jnp.asarray(nodes.sigma))[jnp.array([0, 3])]
-    logit_p = jax.scipy.special.logit(jnp.asarray(nodes.p_outlier))[jnp.array([0, 3])]
-    middle, sd = ((a[0] + a[1]) / 2 for a in (log_sigma, logit_p)), ((a[1] - a[0]) / 2 for a in (log_sigma, logit_p))
-    sigma, p_outlier = (m + s * normal[:, k] for k, (m, s) in enumerate(zip(middle, sd, strict=True)))
-    return Noise(jnp.exp(sigma), jax.nn.sigmoid(p_outlier))
+    lowest, highest = (
+        jnp.stack([jnp.log(nodes.sigma[pair]), jax.scipy.special.logit(nodes.p_outlier[pair])]) for pair in (0, 3)
+    )
+    log_sigma, logit_p = ((lowest + highest) / 2 + (highest - lowest) / 2 * normal).T
+    return Noise(jnp.exp(log_sigma), jax.nn.sigmoid(logit_p))
