@@ -27,7 +27,7 @@ def interpolate(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], share:
 
 
 def inverse_pose(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The inverse of a rigid transform."""
+    """The inverse of a rigid transform; NaN where it is."""
     back = np.eye(4)
     back[:3, :3], back[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
     return back

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from bayes3d_ros.geometry.poses import inverse_pose
 from bayes3d_ros.posterior.output_frame import OutputFrame
 from bayes3d_ros.posterior.summarise import modes_by_type
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, SceneSamples
@@ -19,7 +20,7 @@ def table_frame(
 ) -> OutputFrame:
     """The table's frame (z up, origin on the table) as `T_camera_table` has it. Where the table was found in the image
     there is no pose of the camera that might be off."""
-    T_table_camera = inverse(posterior.T_camera_table)
+    T_table_camera = inverse_pose(posterior.T_camera_table)
     sigma = (0.0, 0.0) if posterior.table_found else camera_pose_sigma
     return OutputFrame(name, T_table_camera, sigma, np.eye(4))
 
@@ -58,13 +59,6 @@ def moved_samples(samples: SceneSamples, T: Float[np.ndarray, "4 4"]) -> SceneSa
     position, orientation = samples.position.astype(float), samples.orientation.astype(float)
     position[held], orientation[held] = _moved(T, position[held], orientation[held])
     return samples._replace(position=position, orientation=orientation)
-
-
-def inverse(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Of a rigid transform; NaN where it is."""
-    inverted = np.eye(4)
-    inverted[:3, :3], inverted[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return inverted
 
 
 def _moved(

@@ -8,8 +8,9 @@ import time
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from bayes3d_ros.geometry.poses import inverse_pose
 from bayes3d_ros.posterior.output_frame import OutputFrame
-from bayes3d_ros.posterior.reframe import inverse, table_frame
+from bayes3d_ros.posterior.reframe import table_frame
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_pose_source import CameraPose
 from bayes3d_ros.ros.parameters import SceneParserNodeSettings
@@ -90,5 +91,5 @@ class OutputFrames:
         if T is None:
             raise ValueError(f"output_frame {wanted!r}: {tf.why(stamp_ns, source)}")
         if by_table:
-            return OutputFrame(wanted, T @ inverse(posterior.T_camera_table), (sigma[0], sigma[1]), T)
+            return OutputFrame(wanted, T @ inverse_pose(posterior.T_camera_table), (sigma[0], sigma[1]), T)
         return OutputFrame(wanted, T, (sigma[0], sigma[1]))

@@ -13,12 +13,12 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.poses import inverse_pose
 from bayes3d_ros.io.bag_contents import STORE, TF
 from bayes3d_ros.io.frame_messages import frame_messages, frame_topics
 from bayes3d_ros.io.message_file import MessageFile
 from bayes3d_ros.objects.model import Library, type_names
 from bayes3d_ros.posterior.object_ids import IdMemory, named
-from bayes3d_ros.posterior.reframe import inverse
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.markers import SceneMarkers
@@ -127,7 +127,7 @@ class TrackRecording(OutputRecording):
         stamp, world = estimate.stamp_ns, self.table_frame
         self._path.add(estimate, world)
         camera = Header(stamp=ns_to_stamp(stamp), frame_id=estimate.frame_id)
-        self.transform(transform_message(inverse(estimate.T_world_camera), camera, world), stamp)
+        self.transform(transform_message(inverse_pose(estimate.T_world_camera), camera, world), stamp)
         self.output("camera_pose", camera_pose_message(estimate, world), stamp)
         self.output("particles", camera_particles(estimate, world, self._most), stamp)
         self.output("path", self._path.message(), stamp)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.poses import look_at
+from bayes3d_ros.geometry.poses import inverse_pose, look_at
 from bayes3d_ros.posterior.collision_scene import (
     MOVED,
     REPEAT,
@@ -22,7 +22,7 @@ from bayes3d_ros.posterior.collision_scene import (
     withdrawal,
 )
 from bayes3d_ros.posterior.output_frame import OutputFrame
-from bayes3d_ros.posterior.reframe import in_frame, inverse, table_frame
+from bayes3d_ros.posterior.reframe import in_frame, table_frame
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -136,7 +136,7 @@ def test_in_another_frame_everything_is_told() -> None:
 @pytest.fixture
 def posterior(depth_frame, fake_posterior):
     scene = fake_posterior(depth_frame(), ("bowl", "can"))
-    return replace(scene, T_camera_table=inverse(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3))))
+    return replace(scene, T_camera_table=inverse_pose(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3))))
 
 
 def test_obstacles_are_objects_in_the_frame_of_the_scene(posterior) -> None:

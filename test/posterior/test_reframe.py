@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.poses import look_at, pose_matrix
+from bayes3d_ros.geometry.poses import inverse_pose, look_at, pose_matrix
 from bayes3d_ros.parsing.table_fit import seen_table
 from bayes3d_ros.posterior.output_frame import OutputFrame
 from bayes3d_ros.posterior.pose_statistics import rotation_vectors
-from bayes3d_ros.posterior.reframe import in_frame, inverse, table_frame, told_modes
+from bayes3d_ros.posterior.reframe import in_frame, table_frame, told_modes
 from bayes3d_ros.posterior.summarise import object_estimates
 from bayes3d_ros.settings import ParserSettings
 
@@ -50,7 +50,7 @@ def assert_same_covariance(told: np.ndarray, drawn: np.ndarray) -> None:
 
 
 def test_errors_of_a_camera_in_another_frame_against_monte_carlo() -> None:
-    T_camera_object = inverse(T_TABLE_CAMERA) @ T_TABLE_OBJECT
+    T_camera_object = inverse_pose(T_TABLE_CAMERA) @ T_TABLE_OBJECT
     T_robot_camera = T_ROBOT_TABLE @ T_TABLE_CAMERA
     poses = wrong_cameras(T_robot_camera, np.random.default_rng(0)) @ T_camera_object
     truth = T_robot_camera @ T_camera_object
@@ -65,11 +65,11 @@ def test_errors_on_the_table_against_monte_carlo() -> None:
     plane = np.concatenate([rng.uniform(-0.3, 0.3, (300, 2)), np.zeros((300, 1))], 1)
     points = (plane - T_TABLE_CAMERA[:3, 3]) @ T_TABLE_CAMERA[:3, :3]
     settings = ParserSettings(image_bias=0.0, camera_position_sigma=0.1, camera_angle_sigma=0.2)
-    T_camera_object = inverse(T_TABLE_CAMERA) @ T_TABLE_OBJECT
+    T_camera_object = inverse_pose(T_TABLE_CAMERA) @ T_TABLE_OBJECT
     poses = []
     for T_given in wrong_cameras(T_TABLE_CAMERA, rng):
-        corrected = seen_table(points, inverse(T_given), False, settings).T_camera_table
-        poses.append(inverse(corrected) @ T_camera_object)
+        corrected = seen_table(points, inverse_pose(T_given), False, settings).T_camera_table
+        poses.append(inverse_pose(corrected) @ T_camera_object)
     told = OutputFrame("table", T_TABLE_CAMERA, SIGMA, np.eye(4)).camera_error(T_TABLE_OBJECT[:3, 3])
     drawn = spread(np.array(poses), T_TABLE_OBJECT)
     assert_same_covariance(told, drawn)
@@ -86,7 +86,7 @@ def test_errors_on_the_table_are_the_same_told_in_a_frame_that_it_stands_in() ->
 
 @pytest.fixture
 def posterior(depth_frame, fake_posterior):
-    return replace(fake_posterior(depth_frame(), TYPES, 3), T_camera_table=inverse(T_TABLE_CAMERA))
+    return replace(fake_posterior(depth_frame(), TYPES, 3), T_camera_table=inverse_pose(T_TABLE_CAMERA))
 
 
 def test_a_frame_and_back_is_the_camera_again(posterior) -> None:

@@ -9,8 +9,8 @@ import threading
 import numpy as np
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.poses import inverse_pose
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.posterior.reframe import inverse
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
 from bayes3d_ros.ros.scene_parser import SceneParserNode
 from bayes3d_ros.ros.spinning import run_node
@@ -68,7 +68,7 @@ class FakeParser:
             object_index=samples.type,
             reconstruction=frame.depth,
             segmentation=np.isfinite(frame.depth).astype(np.uint16),
-            T_camera_table=np.eye(4) if frame.T_table_camera is None else inverse(frame.T_table_camera),
+            T_camera_table=np.eye(4) if frame.T_table_camera is None else inverse_pose(frame.T_table_camera),
             table_found=frame.T_table_camera is None,
             ess=(1.0, 0.5),
             seconds=self.seconds,

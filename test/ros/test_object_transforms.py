@@ -10,8 +10,8 @@ import pytest
 import yaml
 from geometry_msgs.msg import TransformStamped
 
-from bayes3d_ros.geometry.poses import look_at, pose_matrix
-from bayes3d_ros.posterior.reframe import in_frame, inverse, table_frame
+from bayes3d_ros.geometry.poses import inverse_pose, look_at, pose_matrix
+from bayes3d_ros.posterior.reframe import in_frame, table_frame
 from bayes3d_ros.ros import object_transforms
 from bayes3d_ros.ros.from_messages import stamp_to_ns, transform_to_matrix
 from bayes3d_ros.ros.object_transforms import ObjectTransforms
@@ -63,7 +63,7 @@ def node() -> SimpleNamespace:
 
 @pytest.fixture
 def posterior(depth_frame, fake_posterior):
-    T_camera_table = inverse(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    T_camera_table = inverse_pose(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
     return replace(fake_posterior(depth_frame(12_345), ("bowl", "can")), T_camera_table=T_camera_table)
 
 

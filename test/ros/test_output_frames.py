@@ -16,8 +16,7 @@ from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.poses import look_at, pose_matrix
-from bayes3d_ros.posterior.reframe import inverse
+from bayes3d_ros.geometry.poses import inverse_pose, look_at, pose_matrix
 from bayes3d_ros.ros import output_frames, tf_poses
 from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose
 from bayes3d_ros.ros.demo import OUTPUTS
@@ -109,7 +108,7 @@ class MadeUpTf:
 
 @pytest.fixture
 def posterior(depth_frame, fake_posterior):
-    return replace(fake_posterior(depth_frame(5), ("bowl", "can")), T_camera_table=inverse(T_TABLE_CAMERA))
+    return replace(fake_posterior(depth_frame(5), ("bowl", "can")), T_camera_table=inverse_pose(T_TABLE_CAMERA))
 
 
 @pytest.fixture

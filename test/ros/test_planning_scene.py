@@ -19,10 +19,10 @@ from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header, String
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.poses import look_at
+from bayes3d_ros.geometry.poses import inverse_pose, look_at
 from bayes3d_ros.objects.boundary_mesh import boundary_mesh
 from bayes3d_ros.posterior.collision_scene import SceneChanges, obstacles_of
-from bayes3d_ros.posterior.reframe import in_frame, inverse, table_frame
+from bayes3d_ros.posterior.reframe import in_frame, table_frame
 from bayes3d_ros.ros import planning_scene
 from bayes3d_ros.ros.from_messages import pose_to_matrix, stamp_to_ns
 from bayes3d_ros.ros.parameters import SceneParserNodeSettings
@@ -48,7 +48,7 @@ def posterior(depth_frame, fake_posterior, library):
     """A brick, a cube and an unknown thing, told in the table's frame."""
     scene = fake_posterior(depth_frame(12_345), library.names)
     unknown = replace(scene.objects[1], type="unknown", size=SIDES, position=scene.objects[1].position + 0.2)
-    T_camera_table = inverse(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
+    T_camera_table = inverse_pose(look_at(np.array([0.1, -0.6, 0.5]), np.zeros(3)))
     scene = replace(scene, objects=(*scene.objects, unknown), T_camera_table=T_camera_table)
     return in_frame(scene, table_frame(scene))
 

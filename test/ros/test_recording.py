@@ -15,10 +15,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from bayes3d_ros.geometry.poses import look_at
+from bayes3d_ros.geometry.poses import inverse_pose, look_at
 from bayes3d_ros.io.bags import RawMessage, raw_messages, read_frames, topics
 from bayes3d_ros.posterior.object_ids import IdMemory, named
-from bayes3d_ros.posterior.reframe import inverse
 from bayes3d_ros.ros import message_definitions, to_messages
 from bayes3d_ros.ros.markers import SceneMarkers
 from bayes3d_ros.ros.message_definitions import MessageDefinitions, type_name
@@ -37,7 +36,7 @@ INPUTS = {"/depth/image_rect", "/depth/camera_info", "/camera_pose"}
 def scenes(depth_frame, fake_posterior, library):
     """Frames with camera poses, and their posteriors."""
     frames = [replace(depth_frame(stamp), T_table_camera=T_TABLE_CAMERA) for stamp in STAMPS]
-    T_camera_table = inverse(T_TABLE_CAMERA)
+    T_camera_table = inverse_pose(T_TABLE_CAMERA)
     return [(f, replace(fake_posterior(f, library.names), T_camera_table=T_camera_table)) for f in frames]
 
 
@@ -131,7 +130,7 @@ def test_tf_is_T_camera_table_and_rosbags_reads_everything(file, scenes) -> None
                 assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "bench")
                 assert transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec == stamp
                 place = [getattr(transform.transform.translation, axis) for axis in "xyz"]
-                np.testing.assert_allclose(place, inverse(T_TABLE_CAMERA)[:3, 3], atol=1e-12)
+                np.testing.assert_allclose(place, inverse_pose(T_TABLE_CAMERA)[:3, 3], atol=1e-12)
 
 
 @pytest.mark.parametrize("table_frame", ["", "camera"])
@@ -164,7 +163,7 @@ def test_a_tracked_camera_is_told_as_the_node_tells_it(tmp_path, scenes) -> None
         (transform,) = STORE.deserialize_cdr(message.data, message.msgtype).transforms
         place = [getattr(transform.transform.translation, axis) for axis in "xyz"]
         assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "bench")
-        np.testing.assert_allclose(place, inverse(camera.T_world_camera)[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(place, inverse_pose(camera.T_world_camera)[:3, 3], atol=1e-12)
 
 
 def test_what_was_written_before_an_error_is_kept_and_nothing_else_is_left(tmp_path, scenes, library) -> None:
