@@ -2,7 +2,9 @@
 
 """Rigid transforms as 4 x 4 matrices."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +26,24 @@ def interpolate(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], share:
     T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
     T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]])))(share).as_matrix()
     return T
+
+
+class StampsAround(NamedTuple):
+    """The neighbours of a stamp among others, and how far it is from the first to the last: 0 to 1. Nanoseconds."""
+
+    first: int
+    last: int
+    share: float
+
+
+def stamps_around(stamps: Sequence[int], stamp_ns: int, max_gap_ns: int) -> StampsAround | None:
+    """Between which of the stamps, ascending, to interpolate at one that is none of them; None where it is not between
+    two that are at most `max_gap_ns` apart: nothing is extrapolated."""
+    after = bisect_left(stamps, stamp_ns)
+    if after in (0, len(stamps)):
+        return None
+    first, last = stamps[after - 1], stamps[after]
+    return None if last - first > max_gap_ns else StampsAround(first, last, (stamp_ns - first) / (last - first))
 
 
 def inverse_pose(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -2,14 +2,14 @@
 
 """Frames and the transforms between them over time, as tf has them; without ROS, for recordings."""
 
-from bisect import bisect_left, insort
+from bisect import insort
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from bayes3d_ros.geometry.poses import interpolate, inverse_pose
+from bayes3d_ros.geometry.poses import interpolate, inverse_pose, stamps_around
 
 Transform = Float[np.ndarray, "4 4"]
 
@@ -38,15 +38,13 @@ class _Track:
     def at(self, stamp_ns: int) -> Link | None:
         if stamp_ns in self.links:
             return self.links[stamp_ns]
-        after = bisect_left(self.stamps, stamp_ns)
-        if after in (0, len(self.stamps)):
+        around = stamps_around(self.stamps, stamp_ns, LONGEST_GAP_NS)
+        if around is None:
             return None
-        first, last = self.stamps[after - 1], self.stamps[after]
-        a, b = self.links[first], self.links[last]
-        if last - first > LONGEST_GAP_NS or a.parent != b.parent:
+        a, b = self.links[around.first], self.links[around.last]
+        if a.parent != b.parent:
             return None
-        share = (stamp_ns - first) / (last - first)
-        return Link(a.parent, interpolate(a.T_parent_child, b.T_parent_child, share))
+        return Link(a.parent, interpolate(a.T_parent_child, b.T_parent_child, around.share))
 
 
 class TransformTree:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from bayes3d_ros.geometry.poses import interpolate
+from bayes3d_ros.geometry.poses import interpolate, stamps_around
 from bayes3d_ros.ros.input_queue import JUMP_NS
 
 Matrix = Float[np.ndarray, "4 4"]
@@ -67,14 +67,10 @@ class PoseHistory:
         """The pose of a stamp: exact, or between two poses that are at most `max_gap` apart; never extrapolated."""
         if stamp_ns in self._poses:
             return self._poses[stamp_ns][0]
-        after = bisect_left(self._stamps, stamp_ns)
-        if after in (0, len(self._stamps)):
+        around = stamps_around(self._stamps, stamp_ns, self._max_gap_ns)
+        if around is None:
             return None
-        before_ns, after_ns = self._stamps[after - 1], self._stamps[after]
-        if after_ns - before_ns > self._max_gap_ns:
-            return None
-        share = (stamp_ns - before_ns) / (after_ns - before_ns)
-        return interpolate(self._poses[before_ns][0], self._poses[after_ns][0], share)
+        return interpolate(self._poses[around.first][0], self._poses[around.last][0], around.share)
 
     def nearest(self, stamp_ns: int) -> Nearest | None:
         """The pose of the nearest stamp, or None where there is no pose."""
