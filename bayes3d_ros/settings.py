@@ -39,6 +39,39 @@ def setting(default: Any, description: str, *, unit: str = "", low: Any = None, 
     )
 
 
+# Settings that the parser, the learner and the tracker share: fields of dataclasses belong to one class each.
+
+
+def _near() -> Any:
+    return setting(
+        0.1,
+        "smallest depth that counts as a measurement; smaller ones are treated as missing",
+        unit="m",
+        low=0.01,
+        high=100.0,
+    )
+
+
+def _far(default: float) -> Any:
+    return setting(
+        default,
+        "largest depth that counts as a measurement; larger ones are treated as missing",
+        unit="m",
+        low=0.1,
+        high=100.0,
+    )
+
+
+def _sigma_max() -> Any:
+    return setting(
+        0.005,
+        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
+        unit="m",
+        low=1e-4,
+        high=0.1,
+    )
+
+
 def validate(settings: Any) -> None:
     """Raise ValueError, naming the field, where a setting lies outside its range."""
     for f in fields(settings):
@@ -99,20 +132,8 @@ class ParserSettings:
         low=0.02,
         high=10.0,
     )
-    near: float = setting(
-        0.1,
-        "smallest depth that counts as a measurement; smaller ones are treated as missing",
-        unit="m",
-        low=0.01,
-        high=100.0,
-    )
-    far: float = setting(
-        5.0,
-        "largest depth that counts as a measurement; larger ones are treated as missing",
-        unit="m",
-        low=0.1,
-        high=100.0,
-    )
+    near: float = _near()
+    far: float = _far(5.0)
     score_width: int = setting(
         160,
         "width to which the depth image is reduced before it is compared with rendered scenes; smaller is "
@@ -136,13 +157,7 @@ class ParserSettings:
         low=1,
         high=9,
     )
-    sigma_max: float = setting(
-        0.005,
-        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
-        unit="m",
-        low=1e-4,
-        high=0.1,
-    )
+    sigma_max: float = _sigma_max()
     surface_bias: float = setting(
         0.0012,
         "standard deviation of a constant depth error of each object: one value for all of its pixels",
@@ -292,20 +307,8 @@ class LearnerSettings:
     workspace_height: float = setting(
         0.5, "height of the workspace above the table; higher returns are ignored", unit="m", low=0.02, high=10.0
     )
-    near: float = setting(
-        0.1,
-        "smallest depth that counts as a measurement; smaller ones are treated as missing",
-        unit="m",
-        low=0.01,
-        high=100.0,
-    )
-    far: float = setting(
-        3.0,
-        "largest depth that counts as a measurement; larger ones are treated as missing",
-        unit="m",
-        low=0.1,
-        high=100.0,
-    )
+    near: float = _near()
+    far: float = _far(3.0)
     gap: float = setting(
         0.02,
         "smallest distance between two objects; returns that are closer are taken for one object",
@@ -395,27 +398,9 @@ class TrackerSettings:
         low=1,
         high=9,
     )
-    sigma_max: float = setting(
-        0.005,
-        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
-        unit="m",
-        low=1e-4,
-        high=0.1,
-    )
-    near: float = setting(
-        0.1,
-        "smallest depth that counts as a measurement; smaller ones are treated as missing",
-        unit="m",
-        low=0.01,
-        high=100.0,
-    )
-    far: float = setting(
-        5.0,
-        "largest depth that counts as a measurement; larger ones are treated as missing",
-        unit="m",
-        low=0.1,
-        high=100.0,
-    )
+    sigma_max: float = _sigma_max()
+    near: float = _near()
+    far: float = _far(5.0)
     table: bool = setting(True, "whether images show the table too; false: only the objects are used for tracking")
     speed_change: float = setting(
         0.3,
