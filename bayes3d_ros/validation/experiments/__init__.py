@@ -27,6 +27,7 @@ EXPERIMENTS: dict[str, str] = {
     "parsing": "bayes3d_ros.validation.experiments.parsing",
     "planted": "bayes3d_ros.validation.experiments.planted",
     "repeatability": "bayes3d_ros.validation.experiments.repeatability",
+    "score-width": "bayes3d_ros.validation.experiments.score_width",
     "type-odds": "bayes3d_ros.validation.experiments.type_odds",
 }
 
