@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The density of a depth image whose errors neighbouring pixels share. Symbols, tests and limits: docs/model.md.
+"""The density of a depth image whose errors neighbouring pixels share. Symbols: docs/model.md.
+Tests and limits: docs/decisions/010-shared-errors.md.
 
 A return z of a pixel whose window shows one surface at depth d belongs to the cell of that surface in a block of the
 image, a square of a few pixels:

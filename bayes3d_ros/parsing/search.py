@@ -3,7 +3,8 @@
 """From the whole space of one object to a proposal: cells scored by surface samples, the best of them aligned to the
 data, the best of those scored with the model itself and narrowed round by round.
 
-It takes the place of the coarse-to-fine proposal of Bayes3D (Methodology, B): `docs/model.md` says what differs."""
+It takes the place of the coarse-to-fine proposal of Bayes3D (Methodology, B): docs/departures.md says what differs, and
+why; docs/inference.md lists the levels."""
 
 from collections.abc import Callable
 from typing import NamedTuple
