@@ -53,7 +53,7 @@ def test_relative_links_resolve(document: Path) -> None:
 @pytest.mark.parametrize("text", [*DOCUMENTS, *SOURCES], ids=name)
 def test_pages_that_texts_name_exist(text: Path) -> None:
     """Pages below docs/ by their path, and a heading of theirs in quotes after it."""
-    for page, heading in re.findall(r"\bdocs/([\w/-]+\.md)(?:`?,\s+\"([^\"]+)\")?", text.read_text()):
+    for page, heading in re.findall(r"\bdocs/([\w/-]+\.md)(?:[`)]?,\s+\"([^\"]+)\")?", text.read_text()):
         found = REPOSITORY / "docs" / page
         assert found.is_file(), f"docs/{page}: no such page"
         if heading:
