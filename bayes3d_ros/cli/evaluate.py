@@ -19,12 +19,17 @@ from bayes3d_ros.validation.experiments import EXPERIMENTS, Experiment
 
 @click.command()
 @click.argument("experiment", type=click.Choice(list(EXPERIMENTS)))
-@click.option("--quick", is_flag=True, help="A minute or so: every kind of measurement once.")
-@click.option("--fresh", is_flag=True, help="Start anew; default: go on where such a run was interrupted.")
-@click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its plots.")
+@click.option("--quick", is_flag=True, help="A run of a minute or a few, with fewer scenes.")
+@click.option(
+    "--fresh", is_flag=True, help="Start anew. Default: an interrupted run of the same kind in OUT is continued."
+)
+@click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its pictures.")
 @device_option
 def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
-    """Measure how right the results are: rows as JSON, a summary and plots. `bayes3d report` makes pages of them."""
+    """Measure how right the results are: rows as JSON, a summary and pictures.
+
+    docs/outputs.md says what each experiment measures. `bayes3d report` makes a page of each.
+    """
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.validation import experiments
     from bayes3d_ros.validation.bench import benchmark
