@@ -45,7 +45,8 @@ def setting(default: Any, description: str, *, unit: str = "", low: Any = None, 
 def _near() -> Any:
     return setting(
         0.1,
-        "smallest depth that counts as a measurement; smaller ones are treated as missing",
+        "smallest depth that counts as a measurement; smaller ones are treated as missing. Set it to the shortest "
+        "range of the camera",
         unit="m",
         low=0.01,
         high=100.0,
@@ -55,7 +56,8 @@ def _near() -> Any:
 def _far(default: float) -> Any:
     return setting(
         default,
-        "largest depth that counts as a measurement; larger ones are treated as missing",
+        "largest depth that counts as a measurement; larger ones are treated as missing. Set it beyond the far "
+        "edge of the table",
         unit="m",
         low=0.1,
         high=100.0,
@@ -65,7 +67,8 @@ def _far(default: float) -> Any:
 def _sigma_max() -> Any:
     return setting(
         0.005,
-        "largest standard deviation of the depth noise; its prior is uniform from 0 to this",
+        "largest standard deviation of the noise of a single depth measurement; every value from 0 to this is "
+        "equally likely beforehand. Raise it for a noisy or distant camera",
         unit="m",
         low=1e-4,
         high=0.1,
@@ -104,30 +107,40 @@ class ParserSettings:
     fixed_objects: int = setting(
         -1, "number of objects in every scene, where it is known; -1: infer the number", low=-1, high=32
     )
-    count_ratio: float = setting(0.1, "prior on the number n of objects: the ratio P(n+1) / P(n)", low=1e-6, high=1.0)
+    count_ratio: float = setting(
+        0.1,
+        "prior on the number n of objects: the ratio P(n+1) / P(n). Lower it if objects are reported on little "
+        "evidence; objects in plain view do not depend on it",
+        low=1e-6,
+        high=1.0,
+    )
     table: str = setting(
         "auto",
-        "source of the table plane: the camera pose if there is one, else the depth image (auto); the camera "
-        "pose only, frames without one are refused (pose); the depth image only (depth)",
+        "where the plane of the table comes from. auto: from the camera pose if the image has one, else from the "
+        "depth image; pose: from the camera pose, and an image without one is refused; depth: always from the "
+        "depth image",
         choices=("auto", "pose", "depth"),
     )
     table_width: float = setting(
         1.2,
-        "extent of the area in which objects are searched, along x of the table frame, centred on its origin",
+        "size of the area in which objects are searched, along x of the table frame, centred on its origin. Make "
+        "it as large as the table; a smaller area is faster, and objects outside of it are not found",
         unit="m",
         low=0.1,
         high=10.0,
     )
     table_depth: float = setting(
         1.2,
-        "extent of the area in which objects are searched, along y of the table frame, centred on its origin",
+        "size of the area in which objects are searched, along y of the table frame, centred on its origin. Make "
+        "it as large as the table; a smaller area is faster, and objects outside of it are not found",
         unit="m",
         low=0.1,
         high=10.0,
     )
     workspace_height: float = setting(
         0.5,
-        "height of the space above the table in which objects are searched; higher returns are treated as background",
+        "height of the space above the table in which objects are searched; what is higher is treated as "
+        "background. Raise it for objects that are taller",
         unit="m",
         low=0.02,
         high=10.0,
@@ -136,23 +149,24 @@ class ParserSettings:
     far: float = _far(5.0)
     score_width: int = setting(
         160,
-        "width to which the depth image is reduced before it is compared with rendered scenes; smaller is "
-        "faster and less accurate",
+        "width to which the depth image is reduced before it is compared with rendered scenes; its height "
+        "follows. Less is faster and loses small or thin objects; more is slower and more exact",
         unit="px",
         low=16,
         high=1280,
     )
     likelihood: str = setting(
         "depth",
-        "noise model of a depth pixel. depth: neighbouring pixels share errors (the only model that reports "
-        "unknown objects); independent: independent errors, overconfident on real images; points: the "
-        "independent 3D points of the Bayes3D paper, which underestimates the noise",
+        "model of the errors of depth. depth: neighbouring pixels share errors, as in real cameras; the only one "
+        "that reports unknown objects, and it needs a CPU. independent: every pixel errs alone; runs on a GPU "
+        "too, and is far too sure of poses on real images. points: the independent 3D points of the Bayes3D "
+        "paper, for comparison; it underestimates the noise",
         choices=("depth", "independent", "points"),
     )
     window: int = setting(
         3,
-        "side of the square of rendered pixels that an observed pixel is compared with; odd, and 3 with "
-        "likelihood: depth",
+        "side of the square of rendered pixels with which a measured pixel is compared; odd, and 3 with "
+        "likelihood: depth. More tolerates larger sideways errors and is slower",
         unit="px",
         low=1,
         high=9,
@@ -160,111 +174,150 @@ class ParserSettings:
     sigma_max: float = _sigma_max()
     surface_bias: float = setting(
         0.0012,
-        "standard deviation of a constant depth error of each object: one value for all of its pixels",
+        "standard deviation of a depth error that all pixels of an object share: the camera sees the whole object "
+        "too near or too far. Raise it if repeated images put an object at different depths",
         unit="m",
         low=0.0,
         high=0.05,
     )
     surface_waves: float = setting(
         0.001,
-        "standard deviation of a smooth depth error that varies over a surface, as a wavy pattern does",
+        "standard deviation of a smooth depth error that varies over a surface. Raise it if flat surfaces look "
+        "wavy in the depth image",
         unit="m",
         low=0.0,
         high=0.05,
     )
     wave_length: float = setting(
         0.05,
-        "correlation length of surface_waves: the distance at which the correlation has fallen to 1/e",
+        "distance on a surface over which the error of surface_waves changes: its correlation falls to 1/e there",
         unit="m",
         low=0.005,
         high=1.0,
     )
     model_error: float = setting(
         0.001,
-        "standard deviation of the distance between an object and its model, in patches of 15 mm",
+        "standard deviation of the distance between an object's surface and its model, in patches of 15 mm. Raise "
+        "it for worn objects or coarse models; similar types are then harder to tell apart",
         unit="m",
         low=0.0,
         high=0.05,
     )
     object_lean: float = setting(
         0.015,
-        "standard deviation of how far an object tilts from the resting pose of its model, about each horizontal axis",
+        "standard deviation of the angle by which an object tilts from the resting pose of its model, about each "
+        "horizontal axis. Raise it for soft or uneven objects",
         unit="rad",
         low=0.0,
         high=0.3,
     )
     bad_share: float = setting(
         0.04,
-        "probability that a patch of 15 mm of an object is dented, worn or badly measured, by up to 2 cm "
-        "towards the camera; a dent of several patches counts once for each",
+        "probability that a patch of 15 mm of an object is dented, worn or badly measured, by up to 2 cm towards "
+        "the camera. A dent of several patches counts once for each. Raised too far, a wrong type is excused",
         low=0.0,
         high=0.9,
     )
     edge_share: float = setting(
         0.1,
-        "probability that a return at a depth edge lies anywhere between the front and the back surface",
+        "probability that a measurement at a depth edge lies anywhere between the front and the back surface. "
+        "Raise it for cameras that smear edges",
         low=0.0,
         high=0.9,
     )
     edge_blur: float = setting(
         0.7,
-        "standard deviation of the sideways displacement of a return at a depth edge, in pixels of the reduced image",
+        "standard deviation of the sideways displacement of a measurement at a depth edge, in pixels of the "
+        "reduced image (score_width)",
         unit="scored px",
         low=0.0,
         high=3.0,
     )
     outline_sigma: float = setting(
         0.00085,
-        "standard deviation of the angle by which the camera displaces the outline of an object in the image, along "
-        "either axis; about half a pixel of a camera with 640 columns",
+        "standard deviation of the angle by which the camera displaces the whole outline of an object, along "
+        "either axis. Half a pixel of the camera is typical (0.00085 rad with 640 columns). Positions are no more "
+        "exact than this angle times the distance",
         unit="rad",
         low=0.0,
         high=0.02,
     )
     image_bias: float = setting(
-        0.001, "standard deviation of a constant depth error of the whole image", unit="m", low=0.0, high=0.05
+        0.001,
+        "standard deviation of a depth error that the whole image shares. Raise it for a camera whose depth scale "
+        "drifts",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
     camera_position_sigma: float = setting(
-        0.002, "standard deviation of the height of a given camera pose above the table", unit="m", low=0.0, high=0.1
+        0.002,
+        "standard deviation of the height of a given camera pose above the table. Raise it if the hand-eye "
+        "calibration is less exact, or objects seem to float or sink",
+        unit="m",
+        low=0.0,
+        high=0.1,
     )
     camera_angle_sigma: float = setting(
         0.005,
-        "standard deviation of the two tilts of a given camera pose relative to the table",
+        "standard deviation of the two tilts of a given camera pose relative to the table. Raise it if the "
+        "hand-eye calibration is less exact",
         unit="rad",
         low=0.0,
         high=0.2,
     )
     unknown: bool = setting(
-        True, "whether an object may be of no type in the library; it is then reported as unknown, with a box"
+        True,
+        "whether objects of no type in the library are reported: as unknown, with a box. false: every object is "
+        "taken for the best type of the library, or for outliers",
     )
     unknown_probability: float = setting(
-        0.1, "prior probability that an object is of no type in the library", low=1e-6, high=0.999
+        0.1,
+        "prior probability that an object is of no type in the library. Raise it where most objects are not in "
+        "the library",
+        low=1e-6,
+        high=0.999,
     )
     min_probability: float = setting(
-        0.5, "smallest probability of existence at which an object is listed in the results", low=0.0, high=1.0
+        0.5,
+        "smallest probability of existence at which an object is listed in the results. The samples hold all "
+        "objects, listed or not",
+        low=0.0,
+        high=1.0,
     )
     particles: int = setting(
         96,
-        "number of scenes (particles) of the sequential Monte Carlo sampler; more cost time and give steadier results",
+        "number of scenes (particles) that the sampler carries. More take time in proportion, and make "
+        "probabilities and evidence steadier; 24 suffice for poses",
         low=1,
         high=100000,
     )
     ess_threshold: float = setting(
-        0.3, "resample when the effective sample size falls below this fraction of the particles", low=0.0, high=1.0
+        0.3,
+        "the particles are resampled, and moved by MCMC, when their effective sample size falls below this "
+        "fraction of their number. Higher is slower and steadier",
+        low=0.0,
+        high=1.0,
     )
     rejuvenated_objects: int = setting(
-        1, "number of objects resampled by MCMC moves after the last object is added", low=0, high=100
+        1,
+        "number of objects that are moved again by MCMC after the last object is added. More take time for each, "
+        "and help in crowded scenes",
+        low=0,
+        high=100,
     )
     tempering_steps: int = setting(
         0,
-        "number of steps in which the posterior is flattened and sharpened again during those MCMC moves, to "
-        "move between distant modes",
+        "number of steps in which the posterior is flattened and sharpened again during the MCMC moves of "
+        "rejuvenated_objects, so that objects move between distant poses. 0: off; each step takes as long as a "
+        "move",
         low=0,
         high=20,
     )
     seed: int = setting(
         0,
-        "seed of the random numbers; combined with each image's stamp, so that an image always gives the same result",
+        "seed of the random numbers. It is combined with the stamp of the image, so that the same image always "
+        "gives the same result",
         low=0,
         high=2**31 - 1,
     )
@@ -295,54 +348,84 @@ class ParserSettings:
 class LearnerSettings:
     """Settings of the object learner. Lengths are metres in the table frame."""
 
-    voxel_size: float = setting(0.004, "edge length of a voxel of the learned model", unit="m", low=0.001, high=0.05)
-    workspace_x: float = setting(0.0, "centre of the workspace, along x of the table frame", unit="m")
-    workspace_y: float = setting(0.0, "centre of the workspace, along y of the table frame", unit="m")
+    voxel_size: float = setting(
+        0.004,
+        "edge length of a voxel of the learned model. Smaller keeps finer detail and needs more views; 3 to 5 mm "
+        "suit objects of a hand's size",
+        unit="m",
+        low=0.001,
+        high=0.05,
+    )
+    workspace_x: float = setting(
+        0.0, "centre of the area in which the object is looked for, along x of the table frame", unit="m"
+    )
+    workspace_y: float = setting(
+        0.0, "centre of the area in which the object is looked for, along y of the table frame", unit="m"
+    )
     workspace_width: float = setting(
-        1.0, "extent of the workspace, along x of the table frame", unit="m", low=0.05, high=10.0
+        1.0,
+        "size of the area in which the object is looked for, along x of the table frame. Make it smaller to leave "
+        "out what stands beside the object",
+        unit="m",
+        low=0.05,
+        high=10.0,
     )
     workspace_depth: float = setting(
-        1.0, "extent of the workspace, along y of the table frame", unit="m", low=0.05, high=10.0
+        1.0,
+        "size of the area in which the object is looked for, along y of the table frame. Make it smaller to leave "
+        "out what stands beside the object",
+        unit="m",
+        low=0.05,
+        high=10.0,
     )
     workspace_height: float = setting(
-        0.5, "height of the workspace above the table; higher returns are ignored", unit="m", low=0.02, high=10.0
+        0.5,
+        "height of the space above the table in which the object is looked for; what is higher is ignored. Raise "
+        "it for taller objects",
+        unit="m",
+        low=0.02,
+        high=10.0,
     )
     near: float = _near()
     far: float = _far(3.0)
     gap: float = setting(
         0.02,
-        "smallest distance between two objects; returns that are closer are taken for one object",
+        "smallest distance between two objects. Things that are closer are learned as one object: lower it if "
+        "they stand close together, raise it if an object falls into parts",
         unit="m",
         low=0.002,
         high=1.0,
     )
     cluster: str = setting(
         "only",
-        "which object to learn if the workspace holds several: none, the view is refused (only); the largest;"
-        " or the one nearest to the centre of the workspace (central)",
+        "which object to learn if several stand in the workspace. only: none, the view is refused; largest: the "
+        "one with the most measurements; central: the one nearest to the centre of the workspace",
         choices=("only", "largest", "central"),
     )
     at_x: float = setting(
         math.nan,
-        "with at_y: learn the object nearest to this place on the table, whatever cluster says; x in the "
-        "table frame, as in table_position of the results of scene_parser; .nan: no place",
+        "x of the place of the object to learn, in the table frame, as table_position in the results of "
+        "scene_parser. Given together with at_y, the object nearest to the place is learned, whatever cluster "
+        "says; .nan: no place",
         unit="m",
     )
     at_y: float = setting(
         math.nan,
-        "with at_x: learn the object nearest to this place on the table; y in the table frame; .nan: no place",
+        "y of the place of the object to learn, in the table frame. Given together with at_x; .nan: no place",
         unit="m",
     )
     max_shift: float = setting(
         0.03,
-        "largest error of a camera pose, at the object, that is corrected; a view with a larger one is left out",
+        "largest error of a camera pose that is corrected, as a displacement of the object. A view that needs "
+        "more is left out. Raise it if good views are left out and the calibration is poor",
         unit="m",
         low=0.0,
         high=0.5,
     )
     max_turn: float = setting(
         0.09,
-        "largest tilt of the table against the camera pose that is corrected; a view with a larger one is refused",
+        "largest angle between the table in the image and the table of the camera pose that is corrected. A view "
+        "with more is refused: its camera pose is wrong",
         unit="rad",
         low=0.0,
         high=0.5,
@@ -379,21 +462,23 @@ class TrackerSettings:
 
     hypotheses: int = setting(
         1024,
-        "number of camera poses rendered and scored per image; more cost time and give steadier results",
+        "number of camera poses that are rendered and scored for an image. More take time in proportion, and give "
+        "steadier results",
         low=460,
         high=1000000,
     )
     score_width: int = setting(
         40,
-        "width to which the depth image is reduced before it is compared with rendered scenes; smaller is "
-        "faster and less accurate",
+        "width to which the depth image is reduced before it is compared with rendered scenes; its height "
+        "follows. Less is faster and less exact",
         unit="px",
         low=8,
         high=1280,
     )
     window: int = setting(
         3,
-        "side of the square of rendered pixels that an observed pixel is compared with; odd",
+        "side of the square of rendered pixels with which a measured pixel is compared; odd. More tolerates "
+        "larger sideways errors and is slower",
         unit="px",
         low=1,
         high=9,
@@ -401,87 +486,103 @@ class TrackerSettings:
     sigma_max: float = _sigma_max()
     near: float = _near()
     far: float = _far(5.0)
-    table: bool = setting(True, "whether images show the table too; false: only the objects are used for tracking")
+    table: bool = setting(
+        True,
+        "whether the images show the table. true: it is used for tracking, as the objects are; false: only the "
+        "objects are, for objects without a table in sight",
+    )
     speed_change: float = setting(
         0.3,
-        "scale of the change of the camera's velocity from one image to the next",
+        "scale of the change of the camera's velocity from one image to the next. Raise it if a camera that is "
+        "moved by jerks is lost",
         unit="m/s",
         low=0.001,
         high=100.0,
     )
     turn_change: float = setting(
         0.9,
-        "scale of the change of the camera's angular velocity from one image to the next",
+        "scale of the change of the camera's angular velocity from one image to the next. Raise it if a camera "
+        "that is turned by jerks is lost",
         unit="rad/s",
         low=0.001,
         high=100.0,
     )
     frame_time: float = setting(
-        0.033, "time between images that is assumed for the first image", unit="s", low=0.001, high=10.0
+        0.033, "time since the image before that is assumed for the first image", unit="s", low=0.001, high=10.0
     )
     longest_gap: float = setting(
         1.0,
-        "longest time between two images over which the camera is tracked; after a longer one it is searched for",
+        "longest time between two images over which the camera is tracked. After a longer one it is searched for "
+        "in the whole scene",
         unit="s",
         low=0.01,
         high=60.0,
     )
     nearest_camera: float = setting(
         0.3,
-        "minimum distance of the camera from the objects when searching for a lost camera in a known world "
-        "without a table",
+        "smallest distance of the camera from the objects when a lost camera is searched for in a world from a "
+        "file, without a table",
         unit="m",
         low=0.05,
         high=100.0,
     )
     farthest_camera: float = setting(
         1.5,
-        "maximum distance of the camera from the objects when searching for a lost camera in a known world "
-        "without a table",
+        "largest distance of the camera from the objects when a lost camera is searched for in a world from a "
+        "file, without a table",
         unit="m",
         low=0.05,
         high=100.0,
     )
     lowest_camera: float = setting(
         0.2,
-        "minimum camera elevation above the objects when searching for a lost camera in a known world without a table",
+        "smallest elevation of the camera above the objects, as an angle, when a lost camera is searched for in a "
+        "world from a file, without a table",
         unit="rad",
         low=-1.5,
         high=1.5,
     )
     highest_camera: float = setting(
         1.4,
-        "maximum camera elevation above the objects when searching for a lost camera in a known world without a table",
+        "largest elevation of the camera above the objects, as an angle, when a lost camera is searched for in a "
+        "world from a file, without a table",
         unit="rad",
         low=-1.5,
         high=1.5,
     )
     least_explained: float = setting(
         0.5,
-        "smallest share of the objects' pixels that must agree with the predicted image; below it the camera is lost",
+        "smallest share of the objects' pixels whose measurement must agree with the predicted image; below it "
+        "the camera counts as lost. Lower it if objects are often hidden by others that are not part of the world",
         low=0.0,
         high=1.0,
     )
     depth_bias: float = setting(
-        0.0015, "standard deviation of a constant depth error of the whole image", unit="m", low=0.0, high=0.05
+        0.0015,
+        "standard deviation of a depth error that the whole image shares. The reported covariance includes it",
+        unit="m",
+        low=0.0,
+        high=0.05,
     )
     depth_waviness: float = setting(
         0.0017,
-        "standard deviation of a smooth depth error that varies over a surface, as a wavy pattern does",
+        "standard deviation of a smooth depth error that varies over a surface. The reported covariance includes it",
         unit="m",
         low=0.0,
         high=0.05,
     )
     waviness_length: float = setting(
         0.05,
-        "correlation length of depth_waviness: the distance at which the correlation has fallen to exp(-1/2)",
+        "distance on a surface over which the error of depth_waviness changes: its correlation falls to exp(-1/2) "
+        "there",
         unit="m",
         low=0.005,
         high=1.0,
     )
     seed: int = setting(
         0,
-        "seed of the random numbers; combined with each image's stamp, so that an image always gives the same result",
+        "seed of the random numbers. It is combined with the stamp of the image, so that the same image always "
+        "gives the same result",
         low=0,
         high=2**31 - 1,
     )

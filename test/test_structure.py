@@ -52,7 +52,8 @@ def test_files_that_texts_name_exist() -> None:
     """Whole paths are from the package or the repository; a bare name is a file somewhere in them."""
     sources = [path for folder in (PACKAGE, REPOSITORY / "test") for path in folder.rglob("*.py")]
     names = {path.name for path in (*sources, *(REPOSITORY / "launch").glob("*.py"), REPOSITORY / "setup.py")}
-    for text in (*sources, *REPOSITORY.glob("docs/*.md"), REPOSITORY / "README.md", REPOSITORY / "bags" / "README.md"):
+    documents = [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), REPOSITORY / "bags" / "README.md"]
+    for text in (*sources, *documents):
         for name in re.findall(r"`([\w./]+\.py)", text.read_text()):
             found = name in names or any((folder / name).exists() for folder in (PACKAGE, REPOSITORY, text.parent))
             assert found, f"{text}: there is no {name}"

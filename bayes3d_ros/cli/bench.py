@@ -16,7 +16,10 @@ from bayes3d_ros.files.atomic import write_json
 @click.option("--json", "file", type=FILE, help="Also write the rows, the machine and the versions to this file.")
 @device_option
 def bench(file: Path | None) -> None:
-    """Measure how fast this machine is."""
+    """Measure how fast this machine is: rendering and scoring, parsing, memory, tracking, and a node.
+
+    Rows are printed as they are measured; docs/speed.md says what they mean.
+    """
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.validation.bench import benchmark, kernel_speed, tracking_speed
     from bayes3d_ros.validation.bench.speed_rows import growth

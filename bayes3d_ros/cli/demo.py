@@ -11,10 +11,17 @@ from bayes3d_ros.cli.options import FOLDER
 
 @click.command()
 @click.option("--out", default="bayes3d_demo", show_default=True, type=FOLDER, help="Folder for pictures and logs.")
-@click.option("--unknown", is_flag=True, help="Meet an object that the library does not hold, learn it, and find it.")
+@click.option(
+    "--unknown",
+    is_flag=True,
+    help="Instead: find an object that the library does not hold, learn it from two views, and find it by its name.",
+)
 def demo(out: Path, unknown: bool) -> None:
-    """Parse a bundled bag through real ROS 2 nodes; succeeds only if every output arrived, and with --unknown only if
-    the new object was told as unknown, learned, and found by its name."""
+    """Parse a bundled bag through real ROS 2 nodes.
+
+    It succeeds only if every output arrived; with --unknown only if the new object was reported as unknown, learned,
+    and found by its name.
+    """
     try:
         from bayes3d_ros.ros.demo import DemoError, run_demo
         from bayes3d_ros.ros.demo_unknown import run_unknown_demo

@@ -2,6 +2,7 @@
 
 """`bayes3d evaluate`: how right the results are."""
 
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,25 @@ import click
 
 from bayes3d_ros.cli.options import FOLDER, device_option
 from bayes3d_ros.cli.progress import progress, say
-from bayes3d_ros.cli.unfinished import CannotGoOnError, steps_on_disk
+from bayes3d_ros.cli.unfinished import CannotGoOnError, left_over
 from bayes3d_ros.files.atomic import write_json
+from bayes3d_ros.validation.commit import commit
 from bayes3d_ros.validation.experiments import EXPERIMENTS, Experiment
 
 
 @click.command()
 @click.argument("experiment", type=click.Choice(list(EXPERIMENTS)))
-@click.option("--quick", is_flag=True, help="A minute or so: every kind of measurement once.")
-@click.option("--fresh", is_flag=True, help="Start anew; default: go on where such a run was interrupted.")
-@click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its plots.")
+@click.option("--quick", is_flag=True, help="A run of a minute or a few, with fewer scenes.")
+@click.option(
+    "--fresh", is_flag=True, help="Start anew. Default: an interrupted run of the same kind in OUT is continued."
+)
+@click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its pictures.")
 @device_option
 def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
-    """Measure how right the results are: rows as JSON, a summary and plots."""
+    """Measure how right the results are: rows as JSON, a summary and pictures.
+
+    docs/outputs.md says what each experiment measures. `bayes3d report` makes a page of each.
+    """
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.validation import experiments
     from bayes3d_ros.validation.bench import benchmark
@@ -32,6 +39,8 @@ def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
     module = experiments.load(experiment)
     report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": module.notes(quick), "summary": None}
     report |= {"machine": benchmark.machine(), "versions": benchmark.versions(), "sources": benchmark.sources()}
+    started = datetime.now(UTC).isoformat(timespec="seconds")
+    report |= {"runs": [{"commit": commit(), "started": started, "first_step": 0}]}
     report |= {"steps": module.count(quick), "steps_done": 0, "rows": []}
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{experiment}.json"
@@ -47,18 +56,23 @@ def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
     click.echo("")
     for name, value in report["summary"].items():
         click.echo(f"{name:<20} {_words(value)}")
-    for path in (file, *module.plot(report["rows"], out)):
+    pictures = module.plot(report["rows"], out)
+    write_json(file, report | {"pictures": [path.name for path in pictures]})
+    for path in (file, *pictures):
         click.echo(f"{path}")
 
 
 def _go_on(report: dict[str, Any], file: Path) -> None:
     """Take what an interrupted run of the same kind left over into the report, and say so; or why that cannot be."""
     try:
-        report["steps_done"], report["rows"] = steps_on_disk(file, report)
+        left = left_over(file, report)
     except CannotGoOnError as error:
         click.echo(f"starting anew: {file} {error}", err=True)
-    if report["steps_done"]:
-        click.echo(f"going on after step {report['steps_done']} of {report['steps']} ({file})", err=True)
+        return
+    if left.steps_done:
+        report["steps_done"], report["rows"] = left.steps_done, list(left.rows)
+        report["runs"] = [*left.runs, *(run | {"first_step": left.steps_done} for run in report["runs"])]
+        click.echo(f"going on after step {left.steps_done} of {report['steps']} ({file})", err=True)
 
 
 def _measure(module: Experiment, report: dict[str, Any], file: Path) -> None:

@@ -12,18 +12,27 @@ from bayes3d_ros.cli.progress import progress
 
 @click.command(name="import")
 @click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FILE)
-@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
-@click.option("--voxel-size", type=click.FloatRange(0, min_open=True), default=0.003, show_default=True, help="Metres.")
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made if it does not exist.")
+@click.option(
+    "--voxel-size",
+    type=click.FloatRange(0, min_open=True),
+    default=0.003,
+    show_default=True,
+    help="Edge length of a voxel in metres. Smaller keeps finer detail.",
+)
 @click.option(
     "--scale",
     type=click.FloatRange(0, min_open=True),
     default=1.0,
     show_default=True,
-    help="Metres that a unit of the meshes is: 0.001 for millimetres.",
+    help="Length of one unit of the meshes in metres: 0.001 for meshes in millimetres.",
 )
 @replace_option
 def import_meshes(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: float, replace: bool) -> None:
-    """Make object models from meshes in metres; a model is named after its file. All or none are written."""
+    """Make object models from mesh files.
+
+    A model is named after its file. If one mesh cannot be used, no model is written.
+    """
     from bayes3d_ros.objects.mesh_import import make_models
     from bayes3d_ros.objects.store import save_model
 

@@ -9,26 +9,48 @@ from typing import Any
 import click
 
 from bayes3d_ros.cli.errors import InputError
-from bayes3d_ros.cli.options import ANY, FOLDER, replace_option, settings_from, table_frame_option
+from bayes3d_ros.cli.options import (
+    ANY,
+    FOLDER,
+    CommandWithSettings,
+    replace_option,
+    settings_from,
+    settings_option,
+    table_frame_option,
+    topic_option,
+)
 from bayes3d_ros.cli.progress import progress
+from bayes3d_ros.settings import LearnerSettings
 
 
-@click.command()
+@click.command(cls=CommandWithSettings, kind=LearnerSettings)
 @click.argument("bag", type=ANY)
-@click.option("--name", required=True, help="What to call the object: letters, digits, '_' and '-'.")
-@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made where missing.")
-@click.option("--voxel-size", type=float, help="Metres; default 0.004.")
-@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
-@click.option("--views", type=click.IntRange(1, 10), default=10, show_default=True, help="Most views to use.")
-@click.option("--cluster", type=click.Choice(["only", "largest", "central"]), help="Which of several things to learn.")
+@click.option("--name", required=True, help="Name of the object: letters, digits, '_' and '-'.")
+@click.option("--library", required=True, type=FOLDER, help="Folder of object models; made if it does not exist.")
+@click.option("--voxel-size", type=float, help="Edge length of a voxel of the model in metres; default 0.004.")
+@topic_option
+@click.option(
+    "--views",
+    type=click.IntRange(1, 10),
+    default=10,
+    show_default=True,
+    help="Largest number of frames to use; they are chosen so that the directions of view differ.",
+)
+@click.option(
+    "--cluster",
+    type=click.Choice(["only", "largest", "central"]),
+    help="Which object to learn if several stand on the table: none, the view is refused (only, the default); the "
+    "largest; or the one nearest to the centre of the workspace (central).",
+)
 @click.option(
     "--at",
     nargs=2,
     type=float,
     metavar="X Y",
-    help="Learn the thing nearest to this place: metres in the table frame, as table_position in scenes.jsonl.",
+    help="Learn the object nearest to this place on the table: metres in the table frame, as table_position in "
+    "scenes.jsonl.",
 )
-@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the learner.")
+@settings_option("learner")
 @table_frame_option
 @replace_option
 def learn(
@@ -43,13 +65,16 @@ def learn(
     replace: bool,
     **options: Any,
 ) -> None:
-    """Learn a model of an object from views of it: depth, CameraInfo and camera_pose (or tf) of one stamp each."""
+    """Learn a model of an object from one to ten views of it on a table.
+
+    A view is a depth image of BAG with its CameraInfo and a camera pose, from the topic camera_pose or from tf. The
+    model NAME.npz and its picture NAME.png are written to the library.
+    """
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.model_plot import plot_model
     from bayes3d_ros.learning.learn import check_name, spread_views
     from bayes3d_ros.learning.learn import learn as learn_model
     from bayes3d_ros.objects.store import refuse_existing, save_model
-    from bayes3d_ros.settings import LearnerSettings
 
     check_name(name)
     if not replace:

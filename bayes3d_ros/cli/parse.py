@@ -8,35 +8,56 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
-from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
+from bayes3d_ros.cli.options import (
+    ANY,
+    FOLDER,
+    CommandWithSettings,
+    device_option,
+    seed_option,
+    settings_from,
+    settings_option,
+    table_frame_option,
+    topic_option,
+)
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 from bayes3d_ros.cli.recording import NoRecording, mcap_option, recordings
+from bayes3d_ros.settings import ParserSettings
 
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
     from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.objects.model import Library
     from bayes3d_ros.ros.recording import SceneRecording
-    from bayes3d_ros.settings import ParserSettings
 
 
-@click.command()
+@click.command(cls=CommandWithSettings, kind=ParserSettings)
 @click.argument("bag", type=ANY)
 @click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
 @click.option("--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz and frames/.")
-@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
-@click.option("--table", type=click.Choice(["auto", "pose", "depth"]), help="Where the table's plane comes from.")
-@click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
-@click.option("--particles", type=int, help="Scenes carried by the sampler.")
+@topic_option
+@click.option(
+    "--table",
+    type=click.Choice(["auto", "pose", "depth"]),
+    help="Where the plane of the table comes from: the camera pose if a frame has one, else the image (auto, the "
+    "default); the camera pose only (pose); the image only (depth).",
+)
+@seed_option
+@click.option(
+    "--particles",
+    type=int,
+    help="Number of scenes that the sampler carries, default 96. More take time in proportion, and make probabilities "
+    "steadier.",
+)
 @click.option("--max-objects", type=int, help="Most objects a scene may hold.")
-@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
+@settings_option("parser")
 @click.option(
     "--camera-pose-sigma",
     "sigma",
     type=(click.FloatRange(0.0, 1.0), click.FloatRange(0.0, 1.0)),
     default=(0.0, 0.0),
     metavar="METRES RADIANS",
-    help="Standard deviations of recorded camera poses, for what is told in the table's frame.",
+    help="Standard deviations of the recorded camera poses along (m) and about (rad) each axis; covariances in the "
+    "table's frame then include them. Default: 0 0.",
 )
 @mcap_option("scene_parser")
 @table_frame_option
@@ -52,12 +73,15 @@ def parse(
     mcap: Path | None,
     **options: Any,
 ) -> None:
-    """Parse every depth frame of BAG into a posterior over scenes."""
+    """Parse every depth frame of BAG into a posterior over scenes.
+
+    BAG is an MCAP file, or a rosbag2 folder of such. Results in OUT: scenes.jsonl (the best scene of each frame, and
+    how sure each part of it is), samples.npz (the posterior) and a picture of each frame.
+    """
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.results import ResultsWriter
     from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.objects.store import load_library
-    from bayes3d_ros.settings import ParserSettings
 
     writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)

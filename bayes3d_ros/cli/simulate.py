@@ -13,7 +13,10 @@ from bayes3d_ros.cli.options import FILE, FOLDER
 @click.argument("scene", metavar="SCENE.yaml", type=FILE)
 @click.option("--out", required=True, type=FOLDER, help="Bag to write; a new folder.")
 def simulate(scene: Path, out: Path) -> None:
-    """Record a simulated depth bag with ground truth."""
+    """Record a simulated depth bag with ground truth.
+
+    SCENE.yaml lists the objects, the camera and its noise: docs/simulation.md. Needs the extra `sim`.
+    """
     from tqdm import tqdm
 
     from bayes3d_ros.validation.simulate.simulation import simulate as record

@@ -9,9 +9,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bayes3d_ros.cli.lines import camera_line, recording_line
-from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
+from bayes3d_ros.cli.options import (
+    ANY,
+    FOLDER,
+    CommandWithSettings,
+    device_option,
+    seed_option,
+    settings_from,
+    settings_option,
+    table_frame_option,
+    topic_option,
+)
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 from bayes3d_ros.cli.recording import NoRecording, mcap_option, recordings
+from bayes3d_ros.settings import TrackerSettings
 
 if TYPE_CHECKING:  # --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
@@ -22,15 +33,23 @@ if TYPE_CHECKING:  # --help must be quick, --device must come before jax
     from bayes3d_ros.tracking.tracker import Tracking
 
 
-@click.command()
+@click.command(cls=CommandWithSettings, kind=TrackerSettings)
 @click.argument("bag", type=ANY)
 @click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
 @click.option("--out", required=True, type=FOLDER, help="Folder for cameras.jsonl and track.png.")
-@click.option("--topic", help="Depth image topic; default: the bag's depth topic.")
-@click.option("--world", type=ANY, help="Known objects and their poses (yaml); default: what the first frame shows.")
-@click.option("--hypotheses", type=int, help="Camera poses scored for every frame; default 1024.")
-@click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
-@click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the tracker.")
+@topic_option
+@click.option(
+    "--world",
+    type=ANY,
+    help="YAML file of known objects and their poses in the table's frame; default: what the first frame shows.",
+)
+@click.option(
+    "--hypotheses",
+    type=int,
+    help="Number of camera poses that are scored for a frame, default 1024. More take time in proportion.",
+)
+@seed_option
+@settings_option("tracker")
 @mcap_option("camera_tracker")
 @table_frame_option
 @device_option
@@ -45,13 +64,15 @@ def track(
     mcap: Path | None,
     **options: Any,
 ) -> None:
-    """Follow the camera of BAG around what its first frame shows, or around a known world."""
+    """Follow the camera of BAG around the objects that its first frame shows, or around a known world.
+
+    Results in OUT: cameras.jsonl (the camera's pose in each frame, and how sure it is) and track.png.
+    """
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.tracking_results import PICTURE_FILE, TrackWriter, plot_track
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.parsing.parser import SceneParser
-    from bayes3d_ros.settings import TrackerSettings
     from bayes3d_ros.tracking.session import CameraFollower
     from bayes3d_ros.tracking.tracker import CameraTracker
     from bayes3d_ros.tracking.world_file import load_world

@@ -3,25 +3,34 @@
 """What an interrupted `bayes3d evaluate` left, and whether another run may go on with it."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 # What must be alike, or the rows would not be those of one run. A machine's memory and system do not matter.
 _RUN = ("experiment", "quick", "notes", "steps", "versions", "sources")
 _MACHINE = ("cpu", "cores", "device")
 
 
+class LeftOver(NamedTuple):
+    """What an interrupted run did."""
+
+    steps_done: int = 0
+    rows: Sequence[dict[str, Any]] = ()
+    runs: Sequence[dict[str, Any]] = ()  # commit and date of each part of the run
+
+
 class CannotGoOnError(Exception):
     """What is wrong with what was left, as the end of a line that begins with the file's name."""
 
 
-def steps_on_disk(file: Path, report: dict[str, Any]) -> tuple[int, list[dict[str, Any]]]:
-    """How many steps of the run that this report begins are done, and their rows: none where there is no file, or a
-    finished one. Raises CannotGoOnError."""
+def left_over(file: Path, report: dict[str, Any]) -> LeftOver:
+    """What is done of the run that this report begins: nothing where there is no file, or a finished one. Raises
+    CannotGoOnError."""
     try:
         left = json.loads(file.read_text())
     except FileNotFoundError:
-        return 0, []
+        return LeftOver()
     except OSError as error:
         raise CannotGoOnError(f"cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError):
@@ -29,16 +38,21 @@ def steps_on_disk(file: Path, report: dict[str, Any]) -> tuple[int, list[dict[st
     if not isinstance(left, dict):
         raise CannotGoOnError("is damaged")
     if left.get("summary") is not None:
-        return 0, []
+        return LeftOver()
     mine, its = _kind(report), _kind(left)
     if other := [name for name in mine if its[name] != mine[name]]:
         raise CannotGoOnError(f"is unfinished, but of a run with other {', '.join(other)}")
-    done, rows = left.get("steps_done"), left.get("rows")
-    if type(done) is not int or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+    done, rows, runs = left.get("steps_done"), _objects(left.get("rows")), _objects(left.get("runs", []))
+    if type(done) is not int or rows is None or runs is None:
         raise CannotGoOnError("is damaged")
     if not 0 <= done <= report["steps"] or (rows and not done):
         raise CannotGoOnError("is damaged")
-    return done, rows
+    return LeftOver(done, rows, runs)
+
+
+def _objects(value: Any) -> list[dict[str, Any]] | None:
+    """A list of JSON objects; None where it is anything else."""
+    return value if isinstance(value, list) and all(isinstance(item, dict) for item in value) else None
 
 
 def _kind(report: dict[str, Any]) -> dict[str, Any]:

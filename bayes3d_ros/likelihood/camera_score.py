@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Score hypotheses of where the camera is, in a scene that is known: objects at rest in the world, perhaps a table."""
+"""Score hypotheses about where the camera is, in a known scene: objects at rest in the world, perhaps on a table."""
 
 from functools import partial
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from bayes3d_ros.objects.library_arrays import LibraryArrays
 
 
 class World(NamedTuple):
-    """What the camera moves through."""
+    """The scene that the camera moves through."""
 
     type: Int[Array, "K"]
     T_world_object: Float[Array, "K 4 4"]
@@ -37,8 +37,8 @@ def log_likelihood_of_cameras(
     noise: Noise,
     window: int,
 ) -> Float[Array, "N S P"]:
-    """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier): where nothing is
-    rendered in a pixel's window every likelihood is the outliers' density, so only pixels near a surface count.
+    """log p(image | camera, world) - log p(image | nothing in sight) for every (sigma, p_outlier). Where nothing is
+    rendered in a pixel's window, every likelihood is the outliers' density, so only pixels near a surface count.
     `image.bare_depth` is not used."""
     if gain := kernel(image):
         return gain(_hypotheses(T_camera_world, world), None, image, library, noise, window)

@@ -2,7 +2,7 @@
 
 """Likelihoods of what a depth camera returned, given which pixels did (the mask is taken as given).
 
-`likelihoods` is the one table. Each row gives the density of inliers, and every pixel then has
+The table `likelihoods` lists densities of inliers, one a row. Every pixel then has the density
 p_out a(z) + (1 - p_out) inlier, with a(z) = 3 z^2 / (far^3 - near^3), the density of depth uniform in the frustum.
 
 `independent` is a density of the depth image. For a return z at a pixel with ray r (r_z = 1), and rendered
@@ -12,19 +12,20 @@ points y_j r_j in the pixel's window at distance d_j from its ray,
 
 with the w_j normalised over the window's surface points. It is Bayes3D's mixture (eq. 1) conditioned on the pixel's
 ray, so that it integrates to one over z for every scene. Where the window holds no surface, the density is a(z).
-The constant c (LATERAL) stands for lateral errors, pixels that see what their neighbours look at. Without it every
-pixel that an edge crosses costs up to a dozen nats at once, and the posterior is a heap of splinters.
+The constant c (LATERAL) stands for lateral errors: a camera's pixel sees a little of what its neighbours look at.
+Without it the log likelihood jumps by up to a dozen nats where an edge crosses a pixel.
 
-`points` is Bayes3D's own form: W H free points, each an outlier uniform in the frustum's volume
-V = (far^3 - near^3) W H / (3 fx fy), or what one of the W H rays, any of them, shows, with normal errors in all three
-coordinates. A ray that meets no surface shows a point uniform in its own pixel's part of the frustum. So
+`points` is Bayes3D's own form: W H free points. A point is an outlier, uniform in the frustum's volume
+V = (far^3 - near^3) W H / (3 fx fy); or it is the point that a ray shows, each of the W H rays with equal probability,
+with normal errors in all three coordinates. A ray that meets no surface shows a point uniform in its own pixel's part
+of the frustum. So
 
     p(x) = p_out / V + (1 - p_out) (sum_j N3(x; y_j, sigma^2 I) + b(x) W H / V) / (W H),
 
-b(x) being 1 in pixels whose ray meets nothing. Dividing by W H, which the image fixes, and not by the number of surface
-points keeps p a density for every scene, and what a pixel adds a matter of its window. The sum is cut off at the
-window of the pixel that x lies in: where 3 sigma f / z goes beyond half of it, mass is missing. Given is
-p(x) W H z^2 / (fx fy), the same density over (u, v, z), u and v in pixels, times W H: its outliers are a(z) again.
+with b(x) = 1 in pixels whose ray meets nothing. The sum is divided by W H, which the image fixes, and not by the number
+of surface points: so p is a density for every scene, and a pixel's term depends on its window alone. The sum is cut
+off at the window of the pixel that x lies in: where 3 sigma f / z exceeds half the window, mass is missing. The value
+computed is p(x) W H z^2 / (fx fy), the density over (u, v, z), u and v in pixels, times W H: outliers are a(z) again.
 
 A return beyond the workspace (floor, wall, robot) is free-space evidence: where the scene puts a surface in front of
 it, it is an outlier, p_out a(z); elsewhere it has the scene-independent density a(z).
@@ -58,7 +59,7 @@ class Noise(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Likelihood:
-    """A row of `likelihoods`. What is scored carries it: to jit it is a part of the type, like a static argument."""
+    """A row of `likelihoods`. Images carry it as a static part of their type, so jit compiles for each row."""
 
     name: str = "independent"
 
@@ -75,9 +76,9 @@ class Pixels(NamedTuple):
     outlier_scale: Float[Array, ""]  # 3 / (far^3 - near^3)
     front_margin: Float[Array, ""]  # metres; a surface less than this behind a return still counts as in front
     likelihood: Likelihood = Likelihood()
-    # Of free points: x / z and y / z less those of the pixel's ray. A depth image has its points on the rays.
+    # For free points: x / z and y / z minus those of the pixel's ray. Points of a depth image lie on the rays.
     beside: tuple[Float[Array, "h w T"], Float[Array, "h w T"]] | None = None
-    weight: Float[Array, ""] | np.float32 = np.float32(1)  # share of every pixel's log likelihood that counts
+    weight: Float[Array, ""] | np.float32 = np.float32(1)  # factor on every pixel's log likelihood
 
 
 def inlier_density(
@@ -106,8 +107,8 @@ def ray_mixture(
     window: int,
     lateral: float | Float[Array, ""] = LATERAL,
 ) -> tuple[Array, Array]:
-    """The mixture over the surface points of the window, and whether there are any. beside(dv, du) is the rendered
-    depth so many pixels away; sigma broadcasts against it."""
+    """The mixture over the surface points of the window, and whether there are any. beside(dv, du): rendered depth
+    dv rows and du columns away; sigma broadcasts against it."""
     half = window // 2
     a, b = pixels.ray_x, pixels.ray_y
     norm2 = 1 + a * a + b * b
@@ -136,8 +137,8 @@ def ray_mixture(
 def point_density(
     rendered: Float[Array, "hr wr T"], pixels: Pixels, sigma: Float[Array, "S"], window: int
 ) -> Float[Array, "S h w T"]:
-    """The sum over the window of free points' density, per pixel and metre; `rendered` as in `inlier_density`. It is
-    the sum of Bayes3D's eq. 1, truncated to a window as in its Methodology, B."""
+    """The sum over the window of the density of free points, per pixel and metre; `rendered` as in
+    `inlier_density`. It is the sum of Bayes3D's likelihood, truncated to a window as in its Methodology, B."""
     half = window // 2
     height, width = pixels.depth.shape[:2]
     a, b, z = pixels.ray_x, pixels.ray_y, pixels.depth
@@ -162,8 +163,8 @@ def point_density(
 
 
 def outlier_density(pixels: Pixels) -> Float[Array, "..."]:
-    """Depth uniform in the frustum's volume. The loops for CPUs have the same formula (`cpu/windows.py`, and its limits
-    in `cpu/gain.py`); `test_scene_score.py` compares them with this one."""
+    """Density of depth uniform in the frustum's volume. The loops for CPUs have the same formula (`cpu/windows.py`,
+    its limits in `cpu/gain.py`); `test_scene_score.py` compares them."""
     return pixels.outlier_scale * pixels.depth**2
 
 
@@ -189,7 +190,7 @@ def log_likelihood(
     inlier = likelihoods[pixels.likelihood.name](rendered, pixels, noise.sigma, window)
     outlier, inlier = by_pixel_class(pixels, rendered[half : half + height, half : half + width], inlier)
     tiles = outlier.shape[-1]
-    at_once = 4 if pixels.likelihood.name == "independent" else 2  # densities of other rows may reach further
+    at_once = 4 if pixels.likelihood.name == "independent" else 2  # other densities may be larger
     inlier = inlier.reshape(inlier.shape[0], -1, tiles)
     count = inlier.shape[1] if rows is None else rows * width
     total = pixels.weight * _sum_log(outlier.reshape(-1, tiles), inlier, noise.p_outlier, at_once, count)
@@ -197,8 +198,8 @@ def log_likelihood(
 
 
 def by_pixel_class(pixels: Pixels, rendered: Float[Array, "..."], inlier: Array) -> tuple[Array, Array]:
-    """The outliers' and the inliers' densities of pixels of every kind, whose likelihood is p_out outlier +
-    (1 - p_out) inlier; given `inlier` is that of returns in the workspace."""
+    """Densities of outliers and inliers for pixels of every kind, whose likelihood is p_out outlier + (1 - p_out)
+    inlier. The given `inlier` is for returns in the workspace."""
     a = outlier_density(pixels)
     beyond = jnp.where(rendered < pixels.depth + pixels.front_margin, 0.0, a)
     inlier = jnp.where(pixels.pixel_class == IN_WORKSPACE, inlier, jnp.where(pixels.pixel_class == BEYOND, beyond, 1.0))
@@ -212,9 +213,9 @@ def _sum_log(
     at_once: int,
     count: Int[Array, ""] | np.int32 | int,
 ) -> Float[Array, "S P T"]:
-    """Sum of log(p outlier + (1 - p) inlier) over the first `count` pixels, through the logs of products of so many of
-    them. Scaled, so that products stay in the range of float32 for likelihoods of 5e-14 .. 3e5 per metre (four) or ..
-    1e15 (two)."""
+    """Sum of log(p outlier + (1 - p) inlier) over the first `count` pixels, as logs of products of `at_once`
+    pixels. Products are scaled to stay in the range of float32 for likelihoods of 5e-14 to 3e5 per metre (four at
+    once) or to 1e15 (two)."""
     outlier, inlier = _PRODUCT_SCALE * outlier, _PRODUCT_SCALE * inlier
     p = p[None, :, None]
 

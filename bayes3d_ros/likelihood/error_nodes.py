@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the parameters of an image's errors are summed over (`shared_errors.py`): sigma, p_out, the standard deviation
-tau of the table's cells, and the scale of objects' amplitudes.
+"""The nodes at which the parameters of an image's errors are summed (`shared_errors.py`): sigma, p_out, the standard
+deviation tau of the table's cells, and the scale of the objects' amplitudes.
 
-The table's returns nearly settle the first three: log sigma to a percent or less. So the posterior that they alone
-give is found first, as a normal density of log sigma, logit p_out and log tau, by expectation and maximisation over
-the offsets of the table's cells and over which returns are outliers. Its rule of Gauss and Hermite then gives the
-nodes, two of log sigma and of logit p_out and three of log tau. Every scene's own likelihood weighs them: what
-objects' returns say of the noise counts too.
+The table's returns nearly settle the first three (log sigma to a per cent or less). So the posterior given the table's
+returns alone is found first, as a normal density of log sigma, logit p_out and log tau, by expectation and maximisation
+over the offsets of the table's cells and over which returns are outliers. The Gauss-Hermite rule of that density gives
+the nodes: two of log sigma, two of logit p_out and three of log tau. Every scene's own likelihood weighs the nodes, so
+that the objects' returns count too.
 """
 
 from typing import NamedTuple
@@ -29,12 +29,12 @@ _STANDING = 0.008  # metres in front of the table from which returns that touch 
 _LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
 _FEWEST_CELLS = 10
 _STEPS = 12
-_MOST_SDS = 3.0  # by which a scene's noise is moved away from what the table tells
-_WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations where the table tells nothing
+_MOST_SDS = 3.0  # most by which a scene's noise moves away from what the table says
+_WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations if the table says nothing
 
 
 class ErrorNodes(NamedTuple):
-    """S pairs of noise, T amplitudes of the table, A scales of objects' amplitudes, all with all."""
+    """S pairs of noise, T amplitudes of the table and A scales of the objects' amplitudes, in all combinations."""
 
     sigma: Float[np.ndarray, "S"]  # metres, at the reference depth
     p_outlier: Float[np.ndarray, "S"]
@@ -44,14 +44,14 @@ class ErrorNodes(NamedTuple):
 
 
 class TableErrors(NamedTuple):
-    """What the table's returns tell of log sigma, logit p_out and log tau: normal, of independent parts."""
+    """What the table's returns say about log sigma, logit p_out and log tau: independent normal densities."""
 
     mean: Float[np.ndarray, "3"]
     sd: Float[np.ndarray, "3"]
 
 
 class _TableCells(NamedTuple):
-    """Returns of C blocks of the table; beyond them `real` is false."""
+    """Returns of C blocks of the table. In slots without a return `real` is false."""
 
     residual: Float[np.ndarray, "C K"]  # metres: return - table
     precision: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
@@ -73,7 +73,7 @@ def error_nodes(
     (log_sigma, logit_p, log_table), (sd_sigma, sd_p, sd_table) = told
     sigma = np.minimum(np.exp(log_sigma + sd_sigma * _PAIRS[:, 0]), sigma_max)
     p_outlier = 1 / (1 + np.exp(-logit_p - sd_p * _PAIRS[:, 1]))
-    # Priors uniform in sigma and p_out, over the normal density whose rule this is, at places as likely as each other.
+    # Priors uniform in sigma and p_out, divided by the normal density of the rule, which is equal at all four pairs.
     log_noise = np.log(sigma / sigma_max * p_outlier * (1 - p_outlier) * sd_sigma * sd_p)
     places, weights = HERMITE
     tables = np.exp(log_table + sd_table * places) if wave > 0 else np.zeros(len(places))
@@ -86,7 +86,7 @@ def error_nodes(
 
 
 def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErrors:
-    """By expectation and maximisation; the standard deviations are those of the information that is not missing.
+    """Estimates by expectation and maximisation; standard deviations from the information of the observed data.
     Metres."""
     least = np.log([_LEAST_SIGMA, 1e-5, _LEAST_TABLE])
     prior = np.array([np.log(sigma_max / 3), np.log(0.01 / 0.99), np.log(max(wave, _LEAST_TABLE))])
@@ -105,7 +105,7 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
         weight = share * cells.precision / sigma**2
         told = weight.sum(1)
         offset, variance = (weight * cells.residual).sum(1) / (told + tie), 1 / (told + tie)
-        tied = 1 - variance * tie  # the share of each cell's offset that its returns settle
+        tied = 1 - variance * tie  # share of each cell's offset that its returns determine
         of_table = 2 * np.square(tied).sum() + AMPLITUDE_LOG_SD**-2
         inliers, returns = share.sum(), cells.real.sum()
         square = np.square(cells.residual - offset[:, None]) + variance[:, None]
@@ -117,7 +117,7 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
             pull = excess - len(offset) - (mean[2] - prior[2]) / AMPLITUDE_LOG_SD**2
             mean[2] += np.clip(pull / of_table, -0.5, 0.5)
         mean = np.clip(mean, least, np.log([sigma_max, 1e5, 1.0]))
-    # Louis' formula (1982): of complete data, less the variance of what is not known, namely which are outliers.
+    # Louis' formula (1982): information of complete data, minus the variance due to not knowing which are outliers.
     unsure = share * (1 - share)
     of_sigma = 2 * (inliers - tied.sum()) - (unsure * np.square(off2 - 1)).sum()
     of_p = (returns - inliers) * inliers / returns - unsure.sum()
@@ -153,8 +153,8 @@ def _grown(which: Bool[np.ndarray, "H W"], by: int) -> Bool[np.ndarray, "H W"]:
 
 
 def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S TA"]) -> Noise:
-    """sigma and p_outlier of each scene given the image: the table's normal density, moved by what the scene's own
-    likelihood at the four pairs of nodes adds to the table's."""
+    """sigma and p_outlier of each scene given the image: drawn from the table's normal density, moved by what the
+    scene's own likelihood at the four pairs of nodes adds to the table's."""
     log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1).reshape(-1, 2, 2)
     of_sigma, of_p = (jax.nn.logsumexp(log_mass, axis) for axis in (2, 1))
     moved = jnp.stack([0.5 * (a[:, 1] - a[:, 0]) for a in (of_sigma, of_p)], -1)

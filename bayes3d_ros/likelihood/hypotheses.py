@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What kernels are given: hypotheses of what is rendered into which scenes."""
+"""The inputs of kernels: hypotheses, each of which adds objects to a scene."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class RenderedHypotheses(NamedTuple):
-    """What each of N hypotheses adds to its scene: K objects, and a plane."""
+    """What each of N hypotheses adds to its scene: K objects and a plane."""
 
     type: Int[Array, "N K"]
     T_camera_object: Float[Array, "N K 4 4"]
@@ -17,7 +17,8 @@ class RenderedHypotheses(NamedTuple):
 
 
 class SceneDepths(NamedTuple):
-    """What is there already: scenes with a border (`pad_scene`), and the one of each hypothesis."""
+    """Scenes to which hypotheses are added, as depth images with a border (`pad_scene`), and the scene of each
+    hypothesis."""
 
     depth: Float[Array, "A Hp Wp"]
     ancestor: Int[Array, "N"]

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The two models of an image that the parser samples under: pixels that err independently (`NoiseGrid`), and errors
-that neighbours share (`SharedErrors`).
+"""The two models of an image under which the parser samples: pixels that err independently (`NoiseGrid`), and errors
+that neighbouring pixels share (`SharedErrors`).
 
-Both hand out log likelihoods at nodes [S, P] of the errors' parameters, which add up from object to object, and
-integrate over the nodes."""
+Both give log likelihoods at nodes [S, P] of the error parameters. These add up from object to object; `log_marginal`
+integrates over the nodes.
+"""
 
 from typing import NamedTuple
 
@@ -36,7 +37,7 @@ _LEAST_P = 1e-3  # of outliers, in a search
 
 
 class SharedErrors(NamedTuple):
-    """`shared_errors.py` for one image, and what the empty table's returns say of its nodes."""
+    """`shared_errors.py` for one image, and the log likelihood of the empty table at each node."""
 
     image: SharedErrorImage
     empty: Float[Array, "1 S TA"]  # up to a constant
@@ -48,15 +49,15 @@ ImageModel = NoiseGrid | SharedErrors
 def image_model(
     image: ScoredImage, on_device: ScoredImage, errors: SharedErrorImage | None, grid: NoiseGrid, window: int
 ) -> ImageModel:
-    """The model of an image: of errors that pixels share where there are any. image: of numpy arrays; on_device: the
-    same image; grid: of all images."""
+    """The model of an image: with shared errors if `errors` is given. image: of numpy arrays; on_device: the same
+    image on JAX's device; grid: the noise grid of all images."""
     if errors is None:
         return noise_marginal.for_image(grid, on_device, window)
     return jax.device_put(shared_errors(image, errors))
 
 
 def shared_errors(image: ScoredImage, errors: SharedErrorImage) -> SharedErrors:
-    """Of an image of numpy arrays."""
+    """The model for an image of numpy arrays."""
     bare = np.asarray(image.bare_depth)
     empty = log_density(bare, np.where(np.isfinite(bare), TABLE, NOTHING), image, errors)
     return SharedErrors(errors, (empty - empty.max())[None].astype(np.float32))
@@ -96,7 +97,7 @@ def with_object(
 
 
 def log_marginal(model: ImageModel, loglik_grid: Float[Array, "N S P"]) -> Float[Array, "N"]:
-    """The nodes integrated out."""
+    """log likelihoods with the nodes integrated out."""
     if isinstance(model, NoiseGrid):
         return noise_marginal.log_marginal(loglik_grid, model)
     return jax.nn.logsumexp(loglik_grid + model.image.nodes.log_weight, (-2, -1))
@@ -113,7 +114,8 @@ def empty_likelihood(
 
 
 def likeliest_noise(model: ImageModel, loglik_grid: Float[Array, "S P"]) -> Noise:
-    """The best node's noise, for searches at a single one; of shared errors with what they add to a return."""
+    """sigma and p_outlier of the best node, for searches at a single noise level. Under shared errors, sigma
+    includes the waves of a surface."""
     if isinstance(model, NoiseGrid):
         return noise_marginal.peak(loglik_grid, model)
     nodes, amplitudes = model.image.nodes, model.image.amplitudes

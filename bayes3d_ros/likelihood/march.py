@@ -6,7 +6,8 @@ What is rendered (`slow_renderer.py` renders the same): a surface voxel is hit w
 meets its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
-Most rays end within a few steps and a few graze on for dozens: after the first steps those left are packed together.
+Most rays end within a few steps, and a few go on for dozens: after the first steps the remaining rays are packed
+together.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from bayes3d_ros.objects.library_arrays import EMPTY, INFLATION, OFFSET_RANGE, L
 
 NEAREST_HIT = 0.05  # metres: nothing is met before
 _STEPS_OF_ALL_RAYS = 4  # of all rays alike
-# Then those left are packed into arrays of 1 / share of the size, as many as it takes, for so many steps: three times.
+# Then the remaining rays are packed into arrays of 1 / share of the size, for so many steps, three times in all.
 _STAGES = ((2, 4), (8, 8), (16, 96))
 MOST_STEPS = _STEPS_OF_ALL_RAYS + sum(steps for _, steps in _STAGES)
 NUDGE = 2e-3  # voxels, past a cube's face
@@ -106,7 +107,7 @@ def on_its_way(t: Array, leave: Array) -> Array:
 
 
 def _finish(words: Array, walk: Rays, t: Float[Array, "R"], near: float) -> Float[Array, "R"]:
-    """Walk the rays that are left to their ends, as far as `_STAGES` lets them."""
+    """Walk the remaining rays to their ends, as far as `_STAGES` lets them."""
     leave = walk.leave.ravel()
     for share, steps in _STAGES:
         size = -(-t.size // share)
@@ -174,8 +175,8 @@ def _look_up(words: Int[Array, "V"]) -> Callable:
 
 
 def advance(look_up: Callable, walk: Rays, t: Array, near: float) -> Array:
-    """One step: test the voxel at t, and go on to where the empty box ahead of it ends. A ray that has met a surface at
-    depth z holds -z from then on: with a second array, a CPU would work all of it out twice."""
+    """One step of every ray: test the voxel at t, and go on to where the empty box ahead of it ends. A ray that has
+    met a surface at depth z holds -z from then on: with a second array, a CPU would compute everything twice."""
     o, d, dims = walk.origin, walk.direction, walk.dims
     active = on_its_way(t, walk.leave)
     at = jnp.where(active, t, 0.0)

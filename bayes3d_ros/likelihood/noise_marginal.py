@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise variables are marginalised numerically: log likelihoods on a coarse grid, splines between, a fine sum.
+"""Noise variables are integrated out numerically: log likelihoods on a coarse grid, splines between, a fine sum.
 
-The log likelihood of a scene is smooth in (log sigma, logit p_outlier) but its peak is narrow: a coarse grid is enough
-to interpolate, and far too coarse to sum.
+The log likelihood of a scene is smooth in (log sigma, logit p_outlier), but its peak is narrow: a coarse grid is fine
+enough to interpolate, and much too coarse to sum.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ _DENSE = 4  # sigmas of a reference scene in a coarse step
 
 
 class NoiseGrid(NamedTuple):
-    """The coarse grid, the fine one, and what carries values from one to the other."""
+    """The coarse grid, the fine grid, and the matrices that carry values from the coarse to the fine one."""
 
     coarse: Noise  # [S], [P]
     fine: Noise  # [Sf], [Pf]
@@ -44,8 +44,8 @@ class NoiseGrid(NamedTuple):
 
 
 class _Splines(NamedTuple):
-    """Matrices that carry values on the coarse points of a whole grid's axis, or on the dense points of its sigmas, to
-    other places on the axis."""
+    """Matrices that carry values from the coarse points of an axis, or from the dense points of sigma, to other
+    places on the axis."""
 
     to_sigma_parts: Float[np.ndarray, "K S"]
     to_p_parts: Float[np.ndarray, "L P"]
@@ -55,7 +55,7 @@ class _Splines(NamedTuple):
 
 
 def _splines(grid: NoiseGrid) -> _Splines:
-    """Those that belong to a grid: the sizes of its arrays tell how many coarse and fine points it has."""
+    """The matrices of a grid: the sizes of its arrays tell how many coarse and fine points it has."""
     sigmas, p_outliers = (len(axis) for axis in grid.coarse)
     fine = [(len(axis) - 1) // (count - 1) for axis, count in zip(grid.fine, (sigmas, p_outliers), strict=True)]
     return _splines_of_sizes(sigmas, p_outliers, *fine)
@@ -79,7 +79,7 @@ def _spline(points: int, places: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K
 
 
 def _parts(coarse: int, fine: int) -> Float[np.ndarray, "K"]:
-    """The middles of parts of the fine steps, on an axis whose coarse points are 0, 1, .."""
+    """The middles of the parts of fine steps, on an axis whose coarse points are 0, 1, ..."""
     count = (coarse - 1) * fine * _PARTS
     return (np.arange(count) + 0.5) * (coarse - 1) / count
 
@@ -117,19 +117,19 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
 def for_returns(
     grid: NoiseGrid, pixel_class: Int[Array, "*shape"], weight: Float[Array, ""] | np.floating | float = 1.0
 ) -> NoiseGrid:
-    """The grid for tables of an image with these kinds of pixels, each of this weight. Those beyond the workspace
-    hardly depend on p."""
+    """The grid for log likelihoods of an image with these classes of pixels, each with this weight. Returns beyond
+    the workspace hardly depend on p_outlier, and are not counted."""
     return grid._replace(returns=weight * (jnp.asarray(pixel_class) == IN_WORKSPACE).sum().astype(jnp.float32))
 
 
 @partial(jax.jit, static_argnames="window")
 def for_image(grid: NoiseGrid, image: ScoredImage, window: int) -> NoiseGrid:
-    """The grid for tables of this image: `for_returns`, and what splines in sigma miss.
+    """The grid for log likelihoods of this image: `for_returns`, and a correction of what splines in sigma miss.
 
-    Every return that goes from inlier to outlier as sigma falls bends the log likelihood within a tenth of log sigma,
-    less than half a coarse step. Errors are a nat or two, and move sigma by a third of its posterior's width. Most
-    returns do so alike in every scene, so the empty table is a reference: its log likelihood at four times as many
-    sigmas tells what splines make of every scene's.
+    Every return that turns from inlier to outlier as sigma falls bends the log likelihood within a tenth of log
+    sigma, less than half a coarse step. Splines alone are off by a nat or two, and move sigma by a third of its
+    posterior's width. Most returns bend it alike in every scene, so the empty table is the reference: its log
+    likelihood at four times as many sigmas gives the correction for every scene.
     """
     splines = _splines(grid)
     ends = jnp.log(grid.coarse.sigma[0]), jnp.log(grid.coarse.sigma[-1])
@@ -155,8 +155,8 @@ def _trapezoid(x: np.ndarray) -> np.ndarray:
 
 
 def near_peak(loglik_grid: Float[Array, "S P"], grid: NoiseGrid, count: int = _NEAR) -> NoiseGrid:
-    """The part of the grid, `count` coarse sigmas, about the best sigma of these log likelihoods: at a
-    fraction of the cost, and what is left out has no mass where that sigma is near those of the scenes to come."""
+    """The part of the grid with `count` coarse sigmas about the best sigma of these log likelihoods. It costs a
+    fraction of the whole grid. The other sigmas have no mass, if the best sigmas of the scenes to come are near."""
     sigmas = len(grid.coarse.sigma)
     first = jnp.clip(jnp.argmax(loglik_grid.max(1)) - count // 2, 0, sigmas - count)
     fine = (len(grid.fine.sigma) - 1) // (sigmas - 1)
@@ -185,7 +185,7 @@ def _fine(loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Float[Array, "
 
 
 def log_weight(grid: NoiseGrid) -> Float[Array, "Sf Pf"]:
-    """What is added to splines of log likelihoods on the fine grid: prior mass, and what splines miss."""
+    """Terms added to splines of log likelihoods on the fine grid: prior mass, and the corrections of the splines."""
     exact = jax.lax.Precision.HIGHEST
     missed = jnp.einsum("gp,fp->fg", grid.to_fine_p, grid.sigma_error, precision=exact)
     return grid.log_mass + missed - grid.returns * grid.p_error
@@ -197,10 +197,10 @@ def log_marginal(loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Float[A
 
 
 def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGrid) -> Noise:
-    """One sample of (sigma, p_outlier) per particle given its scene: sigma on the fine grid, p_outlier given it and
-    then sigma given p_outlier on axes of parts of a fine step, and a place in that part. The fine grid is good enough
-    to sum, but its step can be wider than a standard deviation of p_outlier: sampled evenly from it, 50 % intervals
-    hold 58 %."""
+    """One sample of (sigma, p_outlier) for each particle given its scene: first sigma on the fine grid, then
+    p_outlier given sigma, then sigma given p_outlier, on axes of parts of a fine step with a uniform place in the
+    part. The fine grid is good enough to sum, but its step can be wider than a standard deviation of p_outlier:
+    with p_outlier sampled from it, 50 % intervals hold 58 %."""
     splines = _splines(grid)
     s_key, p_key, sigma_key = jax.random.split(key, 3)
     s = jax.random.categorical(s_key, jax.nn.logsumexp(_fine(loglik_grid, grid), -1))
@@ -226,7 +226,8 @@ def sample(key: PRNGKeyArray, loglik_grid: Float[Array, "N S P"], grid: NoiseGri
 def _sample_along(
     key: PRNGKeyArray, values: Float[Array, "N C"], axis: Float[Array, "C"], to_parts: np.ndarray, log_prior: Callable
 ) -> tuple[Int[Array, "N"], Float[Array, "N"]]:
-    """The part, and a place in it, of samples from exp(spline of the values on this axis) times the prior's density."""
+    """Samples from exp(spline of the values on this axis) times the prior's density: the part of the axis, and a
+    place in it."""
     part_key, place_key = jax.random.split(key)
     step = (axis[-1] - axis[0]) / len(to_parts)
     middle = axis[0] + step * (jnp.arange(len(to_parts)) + 0.5)
@@ -240,7 +241,7 @@ def _odds(p: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def peak(loglik_grid: Float[Array, "S P"], grid: NoiseGrid) -> Noise:
-    """The coarse grid's best (sigma, p_outlier), each an array of one, for searches at a single noise level."""
+    """The best (sigma, p_outlier) of the coarse grid, each an array of one, for searches at a single noise level."""
     index = jnp.argmax(loglik_grid)
     columns = loglik_grid.shape[-1]
     return Noise(grid.coarse.sigma[index // columns][None], grid.coarse.p_outlier[index % columns][None])

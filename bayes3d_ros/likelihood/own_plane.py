@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How likely returns are of a surface of which nothing is known, be it an unknown thing's or a dent in a known one: the
-likelihood of known objects, the shape integrated out.
+"""The density of returns from a surface of unknown shape: an unknown thing's, or a dent in a known object. It is the
+likelihood of known objects with the shape integrated out.
 
 In each block of the image the surface is a plane of its own, about a surface that faces the camera,
 
     d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
 
 and its returns err as those of any surface do. With probability 1 - `ANEW` a block goes on from the block to its left
-or from the one above, where there are such: its plane is then that block's, as the returns of that block alone tell,
-turned by N(0, `BEND_SD`^2) along either axis, half of it between the middles of the two, and displaced by
-N(0, `STEP_SD`^2). So the density of a block's returns depends on those to its left and above alone, and the product
-over all blocks integrates to one over all depths.
+or from the block above, where there are such: its plane is then the plane of that block, as the returns of that block
+alone tell it, turned by N(0, `BEND_SD`^2) along either axis, half of it between the middles of the two blocks, and
+displaced by N(0, `STEP_SD`^2). So the density of a block's returns depends only on the blocks to its left and above,
+and the product over all blocks integrates to one over all depths.
 
-Each block's integral is worked out by Laplace's method about the plane that its returns make likeliest, for all that
-stand in front of the table, and is shared out evenly among them: what a surface does not cover of a block it does not
-pay for. So the image alone gives each return's log density.
+Each block's integral is computed by Laplace's method about the plane that its returns make likeliest, for all its
+returns that stand in front of the table, and is divided evenly among these returns: a surface pays only for the part of
+a block that it covers. So each return's log density depends on the image alone.
 """
 
 from typing import NamedTuple
@@ -38,7 +38,7 @@ _FEWEST_INLIERS = 0.5
 
 
 class _Blocks(NamedTuple):
-    """Returns of C blocks that stand in front of the table, at most K of a block."""
+    """Returns of C blocks that stand in front of the table, at most K in a block."""
 
     real: Bool[np.ndarray, "C K"]  # beyond a block's returns: false
     depth: Float[np.ndarray, "C K"]  # metres from the middle
@@ -53,7 +53,7 @@ class _Blocks(NamedTuple):
 
 
 class _Planes(NamedTuple):
-    """Likeliest planes of C blocks, and log of the integrals over all planes."""
+    """The likeliest planes of C blocks, and the logs of the integrals over all planes."""
 
     log_integral: Float[np.ndarray, "C"]
     plane: Float[np.ndarray, "C 3"]  # metres from the middle, slopes
@@ -68,8 +68,8 @@ def own_plane_log_density(
     sigma: Float[np.ndarray, "S"],
     p_outlier: Float[np.ndarray, "S"],
 ) -> Float[np.ndarray, "S H W"]:
-    """log density per metre of each return; of those that do not stand in front of the table that of an outlier.
-    standing: which do; block: pixels a side; sigma: metres, where `spread` is 1."""
+    """log density per metre of each return; for returns that do not stand in front of the table, that of an
+    outlier. standing: which returns do; block: pixels a side; sigma: metres, where `spread` is 1."""
     depth = np.asarray(image.depth, np.float64)
     outlier = float(image.outlier_scale) * np.maximum(depth, 1e-6) ** 2
     density = np.log(p_outlier.astype(float))[:, None, None] + np.log(outlier)
@@ -83,7 +83,7 @@ def own_plane_log_density(
 
 
 def _blocks_of(image: ScoredImage, v, u, spread, outlier, block: int) -> _Blocks:
-    """The returns at these rows and columns, by blocks."""
+    """The returns at these rows and columns, grouped by block."""
     depth = np.asarray(image.depth, np.float64)
     across = -(-depth.shape[1] // block)
     number, which = np.unique(v // block * across + u // block, return_inverse=True)
@@ -121,8 +121,8 @@ def _blocks_of(image: ScoredImage, v, u, spread, outlier, block: int) -> _Blocks
 
 
 def blocks_beside(column: Int[np.ndarray, "C"], row: Int[np.ndarray, "C"]) -> Int[np.ndarray, "2 C"]:
-    """Which block is to the left of each, and which above; -1: none. Blocks are in the order of their rows, and of
-    their columns within a row."""
+    """Which block is to the left of each block, and which is above; -1: none. Blocks are in the order of their
+    rows, and of their columns within a row."""
     across = int(column.max(initial=0)) + 2  # a column between the end of a row and the next one's beginning
     number = row * across + column
 
@@ -134,7 +134,7 @@ def blocks_beside(column: Int[np.ndarray, "C"], row: Int[np.ndarray, "C"]) -> In
 
 
 def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray, "C"]:
-    """Of each block's returns, given those of the blocks to its left and above."""
+    """log density of each block's returns, given those of the blocks to its left and above."""
     count = len(blocks.middle)
     prior = np.broadcast_to(np.diag([DEPTH_SD**-2, SLOPE_SD**-2, SLOPE_SD**-2]), (count, 3, 3))
     alone = _planes(blocks, np.zeros((count, 3)), prior, noise, p, None)
@@ -151,7 +151,7 @@ def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray,
 def _going_on(
     planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"]
 ) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3 3"]]:
-    """Mean and precision of the blocks' planes where they go on from these, which are of other blocks."""
+    """Mean and precision of the blocks' planes if they continue these planes, which belong to the blocks `other`."""
     apart = (blocks.centre - blocks.centre[other]) * blocks.metres[other]
     move, bend = np.tile(np.eye(3), (len(apart), 1, 1)), np.tile(np.eye(3), (len(apart), 1, 1))
     move[:, 0, 1:], bend[:, 0, 1:] = apart, apart / 2
@@ -163,8 +163,8 @@ def _going_on(
 
 
 def _planes(blocks: _Blocks, mean, prior, noise: float, p: float, start: np.ndarray | None) -> _Planes:
-    """Planes with normal priors of these means and precisions. start: the planes that they are followed from; none:
-    they are sought with wide inliers first."""
+    """The likeliest planes, with normal priors of these means and precisions. start: planes from which the search
+    starts; None: it starts with a wide density of inliers."""
     precision = blocks.rays / noise**2
     plane, steps = (np.zeros(mean.shape), _STEPS) if start is None else (start, _MORE_STEPS)
     for step in range(steps + 1):

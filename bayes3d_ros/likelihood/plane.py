@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Depth of a plane, arithmetic only: on CPUs and in kernels alike."""
+"""Depth of a plane: arithmetic only, so that kernels and CPU code share it."""
 
 from collections.abc import Sequence
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Score hypotheses "this scene, and one more object": render the object, and touch only the pixels it can change."""
+"""Score hypotheses "this scene and one more object": render the object, and score only the pixels that it can
+change."""
 
 from functools import partial
 
@@ -116,7 +117,7 @@ def render_objects(
 def log_likelihood_scene(
     scenes: Float[Array, "A Hp Wp"], image: ScoredImage, noise: Noise, window: int
 ) -> Float[Array, "A S P"]:
-    """log p(image | scene) of whole scenes: the slow form, for one scene at a time and for tests."""
+    """log p(image | scene) of whole scenes: slow; for one scene at a time, and for tests."""
     height, width = image.depth.shape
     half = window // 2
     # One tile, grown by pixels without a return to a multiple of four of them.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The observed depth image at scoring resolution, and the parts of it that are scored together."""
+"""The observed depth image at the resolution at which scenes are scored, and the parts of it that are scored
+together."""
 
 from typing import Any, NamedTuple
 
@@ -14,11 +15,11 @@ from bayes3d_ros.likelihood.density import NO_RETURN, Likelihood, Pixels
 
 
 class FreePoints(NamedTuple):
-    """Free 3D points by the pixels that they fall into, in L layers of at most one a pixel."""
+    """Free 3D points, sorted by the pixels that they fall into, in L layers of at most one point a pixel."""
 
     depth: Float[Array, "L H W"]  # their z
     pixel_class: Int[Array, "L H W"]
-    beside_x: Float[Array, "L H W"]  # x / z less that of the pixel's ray
+    beside_x: Float[Array, "L H W"]  # x / z minus that of the pixel's ray
     beside_y: Float[Array, "L H W"]
 
 
@@ -35,13 +36,13 @@ class ScoredImage(NamedTuple):
     outlier_scale: Float[Array, ""]
     front_margin: Float[Array, ""]
     likelihood: Likelihood = Likelihood()
-    weight: Float[Array, ""] | np.float32 = np.float32(1)  # share of every pixel's log likelihood that counts
-    points: FreePoints | None = None  # scored in place of the depth image, of which the search still makes use
+    weight: Float[Array, ""] | np.float32 = np.float32(1)  # factor on every pixel's log likelihood
+    points: FreePoints | None = None  # scored in place of the depth image, which the search still uses
     rows: Int[Array, ""] | np.int32 | None = None  # how many of the H are the camera's; None: all
 
     @property
     def own_rows(self) -> Int[Array, ""] | np.int32 | int:
-        """How many rows the camera has: below them nothing was observed, and nothing is rendered."""
+        """How many rows the camera has. Below them nothing was observed, and nothing is rendered."""
         return self.depth.shape[0] if self.rows is None else self.rows
 
 
@@ -71,12 +72,12 @@ def scored_image(
     sigma_max: float,
     **more: Any,
 ) -> ScoredImage:
-    """The image of a camera at scoring resolution, in arrays of `padded_height` rows: below the camera's nothing
-    returned. What is computed of the image does not depend on them. depth: metres, 0 where there is no return;
-    bare_depth: that of the bare table, inf where it is not seen; near, far, sigma_max: metres; `more`: other
-    fields of the image.
+    """The image of a camera at scoring resolution, in arrays of `padded_height` rows. Rows below the camera's have
+    no return, and results do not depend on them.
 
-    All arrays are numpy's, to be put on a device: JAX would compile the padding itself for every size.
+    depth: metres, 0 where there is no return; bare_depth: depth of the bare table, inf where it is not seen; near,
+    far, sigma_max: metres; `more`: other fields of the image. All arrays are numpy's, to be put on a device: JAX
+    would compile the padding anew for every size.
     """
     rays = camera.rays()
     below = padded_height(camera.width, camera.height) - camera.height
@@ -123,7 +124,7 @@ def at_most(image: ScoredImage, width: int) -> ScoredImage:
 
 
 def observed(image: ScoredImage, u, v, shape: tuple[int, int]) -> Pixels:
-    """The observed pixels of tiles of a shape; those that stick out of the image have no return."""
+    """The observed pixels of tiles of a shape. Pixels outside of the image have no return."""
     height, width = image.depth.shape
     rows, columns = (v + jnp.arange(shape[0])[:, None])[:, None], u + jnp.arange(shape[1])[:, None]
     inside = (rows < image.own_rows) & (columns < width)
@@ -144,7 +145,7 @@ def observed(image: ScoredImage, u, v, shape: tuple[int, int]) -> Pixels:
 
 
 def _observed_points(points: FreePoints, pixels: Pixels, rows, columns, inside) -> Pixels:
-    """Free points in place of the depth of these pixels, layer after layer."""
+    """Free points in place of the depth of these pixels, one layer after the other."""
     count = points.depth.shape[0]
 
     def in_every_layer(a: Array) -> Array:

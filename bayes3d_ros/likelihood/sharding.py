@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hypotheses over several devices by JAX's own sharding: each scores its share of them. The cores of a CPU count as
-devices where JAX is told so (`jax_num_cpu_devices`): a loop over tiles runs on one core only."""
+"""Hypotheses are divided over several devices by JAX's own sharding. The cores of a CPU count as devices if JAX is told
+so (`jax_num_cpu_devices`); otherwise a loop over tiles runs on one core."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,8 +14,8 @@ from jaxtyping import Array
 
 
 def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Callable[..., Any]:
-    """score(hypotheses, *shared), arrays with a row for each hypothesis to arrays with a row for each, as a function
-    that gives the same and computes it on all devices; `shared` is needed by every one of them."""
+    """score(hypotheses, *shared), which maps arrays with a row for each hypothesis to such arrays, as a function
+    that computes the same on all devices; every device gets the whole of `shared`."""
     if len(devices) <= 1:
         return score
     mesh, split = _mesh(devices), PartitionSpec("hypotheses")
@@ -40,8 +40,8 @@ def over_devices(score: Callable[..., Any], devices: Sequence[jax.Device]) -> Ca
 
 
 def on_all(arrays: Any, devices: Sequence[jax.Device]) -> Any:
-    """The same tree of arrays on every device, as results of `over_devices` are: what goes in as it comes out is
-    compiled once."""
+    """The same tree of arrays on every device, as the results of `over_devices` are, so that one compilation serves
+    both."""
     return jax.device_put(arrays, NamedSharding(_mesh(devices), PartitionSpec()) if len(devices) > 1 else None)
 
 

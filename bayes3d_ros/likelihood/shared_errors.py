@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The density of a depth image whose errors neighbouring pixels share. Symbols, tests and limits: docs/model.md.
+"""The density of a depth image whose errors neighbouring pixels share. Symbols: docs/model.md.
+Tests and limits: docs/decisions/010-shared-errors.md.
 
 A return z of a pixel whose window shows one surface at depth d belongs to the cell of that surface in a block of the
 image, a square of a few pixels:
@@ -11,17 +12,18 @@ b ~ N(0, tau^2) is the error of a cell: of the table's surface as the camera see
 probability pi an object's cell is bad (dents, wear, bled edges). Half of the bad ones are off as a whole,
 b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras do not see through solids. The other half are planes of their
 own, as blocks of unknown things are (`own_plane.py`): dents have slopes. Their density is times
-exp(-`SEEN_THROUGH_NATS` x) where their median is behind the surface by x more than `SEEN_THROUGH`.
+exp(-`SEEN_THROUGH_NATS` x) where their median lies more than `SEEN_THROUGH` behind the surface, x metres more.
 a_object ~ N(0, diag(bias^2, lean^2, lean^2)) is a depth error that the whole object shares, with phi = (1, x, y),
-metres from the middle of what is seen of it: nothing stands upright to the degree. w are waves over the object, a
+metres from the middle of its visible part: no object stands upright to the degree. w are waves over the object, a
 Gaussian process with covariance wave^2 exp(-distance / length), by Vecchia's approximation (Vecchia 1988,
 doi 10.1111/j.2517-6161.1988.tb01729.x): the density of a cell is that given the ones to its left and above, as far as
 these are good, so that the product over cells is a density whatever it approximates.
 
-A pixel whose window shows several surfaces is an edge, and belongs to no cell: the mixture of `density.py`, with each
-point as wide as its surface's errors make it and as likely as a blur of the image says (outlines of depth images are
-off by a part of a pixel, and alike along an object), with a share for returns between the window's front and back, and,
-with probability pi, of the `BAD_DEPTH` in front of an object.
+A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is the mixture of
+`density.py`, in which each point is as wide as its surface's errors make it and as likely as a blur of the image says
+(outlines of depth images are off by a part of a pixel, and alike along an object). A share of the density is for
+returns between the window's front and back, and, with probability pi, for returns up to `BAD_DEPTH` in front of an
+object.
 
 Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
 behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else
@@ -48,10 +50,10 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 # These change the posterior.
 BAD_DEPTH = 0.02  # metres towards the camera
-# Metres behind an object's surface to which its cells may be planes of their own, and nats a metre that farther ones
-# pay: a probability that ends would make the density jump.
+# Metres behind an object's surface up to which its cells may be planes of their own at no cost; nats a metre beyond:
+# a sharp limit would make the density jump.
 SEEN_THROUGH, SEEN_THROUGH_NATS = 0.007, 5000.0
-OUTLINE_NATS = 1.3  # outlines of length L are some e^(0.97 L): with less the prior has no sum
+OUTLINE_NATS = 1.3  # a side; there are some e^(0.97 L) outlines of length L: with less the prior has no sum
 SEAM_NATS = 5.0  # a side
 SEAM_DEPTH = 0.01  # metres between neighbouring returns over which depth goes on
 TABLE_MARGIN = 0.008  # metres in front of the table from which a return belongs to something else, or
@@ -63,7 +65,7 @@ LEAST_BLOCK = 2  # pixels
 # Of a Beta distribution with the mean of `bad_share`: quantiles and weights stand for it (three, as of an object).
 BAD_SPREAD = (0.35, 1.0, 2.5)
 BAD_WEIGHT = (0.3, 0.5, 0.2)
-# How a cell's modes, and an object's shared error, are followed
+# Steps to a cell's modes, and to the mode of an object's shared error
 MODE_STEPS, MORE_MODE_STEPS, REWEIGHTED_STEPS = 5, 2, 3  # more: at the other pairs of noise
 FEWEST_INLIERS = 0.5  # returns, of a mode
 SAME_MODE_SDS = 0.5  # standard deviations within which two modes are one
@@ -84,7 +86,7 @@ class Amplitudes(NamedTuple):
 
 
 class SharedErrorImage(NamedTuple):
-    """What the density is given of an image beside `ScoredImage`."""
+    """What the density needs of an image besides `ScoredImage`."""
 
     nodes: ErrorNodes
     amplitudes: Amplitudes
@@ -95,10 +97,10 @@ class SharedErrorImage(NamedTuple):
 
 
 def shared_error_image(image: ScoredImage, amplitudes: Amplitudes, sigma_max: float) -> SharedErrorImage:
-    """Blocks, nodes and unknown surfaces of an image of numpy arrays."""
+    """Blocks, nodes and densities of unknown surfaces, for an image of numpy arrays."""
     depth, inside = np.asarray(image.depth, np.float64), np.asarray(image.pixel_class) == IN_WORKSPACE
     on_table = np.isfinite(np.asarray(image.bare_depth)) & inside
-    # Of the table itself: outliers among the returns would move their median.
+    # The rendered table's median: outliers would move that of the returns.
     reference = float(np.median(np.asarray(image.bare_depth)[on_table])) if on_table.any() else 1.0
     # Between noise that depth does not change and noise that grows with its square.
     spread = np.sqrt(0.5 + 0.5 * (depth / reference) ** 4).astype(np.float32)

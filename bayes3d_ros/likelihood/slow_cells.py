@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cells of surfaces, in float64 and as `shared_errors.py` says it: their returns, and their log likelihood as a
+"""Cells of surfaces, in float64 and as `shared_errors.py` defines them: their returns, and their log likelihood as a
 function of their offset. The reference of `cpu/cells.py`."""
 
 from typing import NamedTuple
@@ -26,7 +26,8 @@ from bayes3d_ros.likelihood.slow_pixel_kinds import PixelKinds
 
 
 class CellModes(NamedTuple):
-    """A cell's log likelihood as a function of its offset b: two modes, and where all returns are outliers."""
+    """A cell's log likelihood as a function of its offset b: up to two modes, and the case that all returns are
+    outliers."""
 
     height: Float[np.ndarray, "2 C"]  # -inf: no such mode
     place: Float[np.ndarray, "2 C"]  # metres
@@ -42,8 +43,8 @@ class CellModes(NamedTuple):
         return np.logaddexp(np.logaddexp.reduce(self.height - 0.5 * np.log(spread) - 0.5 * apart), self.outliers)
 
     def bad(self, own_plane: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
-        """log of the mean of the integral over b uniform in the `BAD_DEPTH` towards the camera, and of what planes of
-        the cells' own say."""
+        """log of the mean of two integrals: over b uniform in the `BAD_DEPTH` towards the camera, and over
+        planes of the cells' own."""
         root = np.sqrt(np.maximum(self.curvature, 1e-12))
         within = log_ndtr(-self.place * root) + log_ndtr((self.place + BAD_DEPTH) * root)  # its ends are far apart
         width = 0.5 * np.log(2 * np.pi) - np.log(root) - np.log(BAD_DEPTH)
@@ -52,7 +53,7 @@ class CellModes(NamedTuple):
 
 
 class SurfaceCells(NamedTuple):
-    """Residuals of C cells of at most K returns; beyond them `real` is false."""
+    """Residuals of C cells of at most K returns. In slots without a return `real` is false."""
 
     residual: Float[np.ndarray, "C K"]  # metres: return - scene
     precision: Float[np.ndarray, "C K"]  # |r|^2 / spread^2
@@ -65,7 +66,7 @@ class SurfaceCells(NamedTuple):
 
 
 def modes_at_nodes(cells: SurfaceCells, errors: SharedErrorImage) -> list[CellModes]:
-    """At every pair of noise, each from the last one's."""
+    """Modes at every pair of noise; the search at each pair starts from the modes of the one before."""
     found: list[CellModes] = []
     for sigma, p in zip(errors.nodes.sigma.astype(float), errors.nodes.p_outlier.astype(float), strict=True):
         found.append(modes(cells, sigma, p, found[-1].place if found else None))
@@ -73,7 +74,7 @@ def modes_at_nodes(cells: SurfaceCells, errors: SharedErrorImage) -> list[CellMo
 
 
 def modes(cells: SurfaceCells, sigma: float, p: float, starts: Float[np.ndarray, "2 C"] | None = None) -> CellModes:
-    """By expectation and maximisation from these places, or from offset 0, and from the median residual."""
+    """Modes by expectation and maximisation, from the places `starts`, or from offset 0 and the median residual."""
     if not len(cells.residual):
         none = np.zeros((2, 0))
         return CellModes(none, none, none, np.zeros(0))
@@ -112,7 +113,7 @@ def cells_of(
     image: ScoredImage,
     errors: SharedErrorImage,
 ) -> SurfaceCells:
-    """Pixels of one surface in one block together."""
+    """The cells of a scene: pixels of one surface in one block together."""
     v, u = np.nonzero(kinds.cell)
     block, across = int(errors.block), -(-depth.shape[1] // int(errors.block))
     key = (label[v, u].astype(int) * 10**7) + v // block * across + u // block
@@ -150,5 +151,5 @@ def cells_of(
 
 
 def lost_density(errors: SharedErrorImage) -> float:
-    """Of returns near outlines that lie up to `LOST_DEPTH` behind, per metre."""
+    """Density per metre of returns near outlines that lie up to `LOST_DEPTH` behind the surface."""
     return LOST_SHARE * float(errors.amplitudes.edge_share) / LOST_DEPTH

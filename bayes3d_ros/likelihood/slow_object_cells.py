@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The cells of one object, in float64 and as `shared_errors.py` says it: how likely they are together, the error that
-they share integrated out and each given the waves in those beside it. The reference of `cpu/object_cells.py`."""
+"""The cells of one object, in float64 and as `shared_errors.py` defines them: their joint likelihood, with the shared
+error integrated out and each cell given the waves in the cells beside it. The reference of `cpu/object_cells.py`."""
 
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells
 
 
 class Neighbours(NamedTuple):
-    """Of C cells of one object: the one in the block to the left and the one above (-1: none), and the correlations of
-    the object's waves with them, and between the two."""
+    """For C cells of one object: the cell in the block to the left and the one in the block above (-1: none), and
+    correlations of the object's waves: with the left one, with the one above, and between those two."""
 
     left: Int[np.ndarray, "C"]
     above: Int[np.ndarray, "C"]
@@ -38,7 +38,7 @@ def neighbours(
 
 
 class CellsGivenOthers(NamedTuple):
-    """What C cells are off given the error that the object shares and the cells to their left and above: normal, with
+    """Offsets of C cells given the error that the object shares and the cells to their left and above: normal, with
     mean `known` + `phi` a and this variance."""
 
     known: Float[np.ndarray, "C"]  # metres
@@ -50,9 +50,9 @@ class CellsGivenOthers(NamedTuple):
 def given_others(
     found: CellModes, phi, a, model: float, waves: float, beside: Neighbours, share: float, bad
 ) -> CellsGivenOthers:
-    """Vecchia's approximation of waves with correlation exp(-distance / length): each cell given those to its left and
-    above, as far as these are good. model, waves: variances of a cell's own error and of the waves; share: of bad
-    cells; bad: what they say."""
+    """Vecchia's approximation of waves with correlation exp(-distance / length): each cell given those to its left
+    and above, as far as these are good. model, waves: variances of a cell's own error and of the waves; share: of
+    bad cells; bad: log likelihoods of bad cells."""
     count = len(phi)
     told, told_place = np.zeros(count), np.zeros(count)
     given = CellsGivenOthers(np.zeros(count), phi.copy(), np.full(count, model + waves), np.zeros((2, count)))
@@ -83,8 +83,8 @@ def given_others(
 def log_object(
     cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
 ) -> float:
-    """log density of the cells of one object, its shared error integrated out by Laplace's method about the mode of
-    three reweighted steps. found: the cells' modes at the node."""
+    """log density of the cells of one object. The shared error is integrated out by Laplace's method about a mode
+    found in three reweighted steps. found: the cells' modes at the node."""
     amplitudes = errors.amplitudes
     share, model = float(amplitudes.bad_share), (scale * float(amplitudes.model)) ** 2
     waves = (scale * float(amplitudes.wave)) ** 2
@@ -125,7 +125,7 @@ def log_object(
 
 
 def _information(found: CellModes, given: CellsGivenOthers):
-    """What the good cells tell of the error that the object shares."""
+    """Information and pull of the good cells on the error that the object shares."""
     weight = given.good * found.curvature / (1 + found.curvature * given.variance)
     pull = np.einsum("kc,kc,ca->a", weight, found.place - given.known, given.phi)
     return np.einsum("kc,ca,cb->ab", weight, given.phi, given.phi), pull

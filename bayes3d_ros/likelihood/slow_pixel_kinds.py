@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What each pixel of a scene is scored as under `shared_errors.py`, in whole images and as the page says it: the
-reference of the kernel (`cpu/patches.py`)."""
+"""The kind of each pixel of a scene, in whole images and as `shared_errors.py` defines it: the reference of the kernel
+(`cpu/patches.py`)."""
 
 from typing import NamedTuple
 
@@ -23,14 +23,14 @@ NOTHING, TABLE, OBJECT = 0, 1, 2  # labels of pixels: object k is OBJECT + k
 
 
 class PixelKinds(NamedTuple):
-    """What each pixel is scored as."""
+    """Which pixels are of which kind."""
 
     unknown: Bool[np.ndarray, "H W"]
     edge: Bool[np.ndarray, "H W"]
     cell: Bool[np.ndarray, "H W"]
     near_outline: Bool[np.ndarray, "H W"]
-    hidden: Bool[np.ndarray, "H W"]  # saw beyond the workspace, through a surface
-    of_object: Bool[np.ndarray, "H W"]  # as far as an object in their window is
+    hidden: Bool[np.ndarray, "H W"]  # the return lies beyond the workspace, behind a surface of the scene
+    of_object: Bool[np.ndarray, "H W"]  # returns at the depth of an object in their window
 
 
 def kinds_of_pixels(
@@ -72,7 +72,7 @@ def near_object(
 
 
 def _goes_on(which: Bool[np.ndarray, "H W"], observed: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels with one of these above, below, left or right of them, at nearly the same depth."""
+    """Pixels that have a pixel of `which` above, below, left or right of them, at nearly the same depth."""
     found = np.zeros(which.shape, bool)
     for dv, du in ((-1, 0), (0, -1), (0, 1), (1, 0)):
         apart = np.abs(shifted(observed, dv, du, np.inf) - observed)
@@ -97,7 +97,8 @@ def around() -> list[tuple[int, int]]:
 
 
 def shifted(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
-    """What is so many rows and columns away in images [*batch, H, W]; `nothing` beyond their borders."""
+    """Images [*batch, H, W] moved: each pixel has the value dv rows and du columns away; `nothing` beyond the
+    borders."""
     height, width = a.shape[-2:]
     grown = np.pad(a, [(0, 0)] * (a.ndim - 2) + [(1, 1), (1, 1)], constant_values=nothing)
     return grown[..., 1 + dv : 1 + dv + height, 1 + du : 1 + du + width]
@@ -106,7 +107,7 @@ def shifted(a: np.ndarray, dv: int, du: int, nothing: float) -> np.ndarray:
 def shows_several(
     depth: Float[np.ndarray, "*batch H W"], label: Int[np.ndarray, "*batch H W"], focal: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, "*batch H W"]:
-    """Pixels whose windows show several surfaces, or whose own rays meet nothing."""
+    """Pixels whose windows show several surfaces, or whose own rays meet no surface."""
     several = label == NOTHING
     for dv, du in around():
         z, there = shifted(depth, dv, du, np.inf), shifted(label, dv, du, NOTHING)
@@ -123,7 +124,8 @@ def about(which: Bool[np.ndarray, "*batch H W"]) -> Bool[np.ndarray, "*batch H W
 
 
 def mask_nats(unknown: Bool[np.ndarray, "H W"], of_object: Bool[np.ndarray, "H W"], image: ScoredImage) -> float:
-    """Of the outlines of what is unknown: prior's nats, negative. of_object: returns that depth should not go on to."""
+    """Log prior of the outlines of unknown things, in nats: negative. of_object: returns to which depth should not
+    go on."""
     observed = np.asarray(image.depth, np.float64)
     inside = (np.asarray(image.pixel_class) == IN_WORKSPACE) & (np.arange(len(observed))[:, None] < image.own_rows)
     total = 0.0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The density of `shared_errors.py`, of whole scenes, in float64 and as the page says it: the reference of the kernel
-(`cpu/shared_gain.py`), and what weighs the empty table, once a frame."""
+"""The density of `shared_errors.py` for whole scenes, in float64 and as it is defined there: the reference of the
+kernel (`cpu/shared_gain.py`). It also scores the empty table, once a frame."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -76,7 +76,8 @@ def log_edges(
 def log_unknown(
     unknown: Bool[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage, node: int
 ) -> Float[np.ndarray, "E"]:
-    """log density of each return that stands in front of the scene: of something unknown, where there may be any."""
+    """log density of each return that stands in front of the scene: as an unknown thing's, or an outlier's if there
+    are none."""
     if errors.amplitudes.unknown:
         return errors.own_plane[node][unknown].astype(np.float64)
     outlier = float(image.outlier_scale) * np.asarray(image.depth, np.float64)[unknown] ** 2

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pull coarse hypotheses onto the data: projective point-to-plane alignment of surface samples, along the three
-directions in which an object can slide and turn on the table."""
+"""Move coarse hypotheses onto the data: projective point-to-plane alignment of surface samples, in the three degrees of
+freedom in which an object can slide and turn on the table."""
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ from bayes3d_ros.parsing.tuning import SEARCH
 def align(
     placement: Placement, returns: UnexplainedReturns, image: ScoredImage, library: LibraryArrays, table: Table
 ) -> tuple[Placement, Float[Array, "N 3 3"]]:
-    """Aligned hypotheses, and the information matrix about (x, y, yaw): J^T J summed over samples, per metre^2 of
-    residual variance."""
+    """Aligned hypotheses, and their information matrices about (x, y, yaw): J^T J summed over samples, to be
+    divided by the variance of a residual in metres^2."""
 
     def step(placement: Placement, tolerance: Float[Array, ""]):
         T = T_camera_object(placement, library, table)
@@ -31,13 +31,13 @@ def align(
         q = observed[..., None] * jnp.stack([image.ray_x[u], image.ray_y[v], jnp.ones_like(observed)], -1)
         residual = (n * (q - p)).sum(-1)
         gap = jnp.abs(observed - z)
-        # What faces away is not what returned, near as it may lie: a wall is thinner than the tolerance.
+        # A surface that faces away returned nothing, however near: walls are thinner than the tolerance.
         facing = surface.cosine() > 0.15
         weight = jnp.where(seen & (observed > 0) & (gap < 3 * tolerance) & facing, 1.0, 0.0)
         weight = weight * returns.unexplained[v, u] / geman_mcclure(residual, tolerance)
         J = normal_motion(surface, placement, table)
         information = jnp.einsum("np,npa,npb->nab", weight, J, J)
-        # A weak pull to where the hypothesis stands: 2 cm and 0.3 rad, for directions that the data leave open.
+        # A weak pull to the hypothesis' own pose (2 cm, 0.3 rad), for directions that the data leave open.
         damped = information + jnp.diag(tolerance**2 / jnp.array([0.02, 0.02, 0.3]) ** 2)
         move = jnp.linalg.solve(damped, jnp.einsum("np,npa,np->na", weight, J, residual)[..., None])[..., 0]
         move = jnp.clip(move, -jnp.array([0.01, 0.01, 0.15]), jnp.array([0.01, 0.01, 0.15]))

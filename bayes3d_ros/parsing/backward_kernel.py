@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which object of a scene came last: the sampler's backward kernel over the orders of a set.
+"""The sampler's backward kernel over the orders of a set: which object of a scene came last.
 
-L(last | scene) is in proportion to exp(-nats that an object alone gains over the empty table), with a floor: the search
-adds what gains most first. Any function of scene and image would do; this one loses little of the evidence.
+L(last | scene) is proportional to exp(-solo_gain), with a floor; solo_gain is what an object alone gains over the empty
+table, in nats. The search adds first what gains most, so the object that gains least alone probably came last. Any
+normalised function of scene and image would be right; this one loses little of the evidence.
 """
 
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from bayes3d_ros.parsing.tuning import SAMPLER
 
 
 class Empty(NamedTuple):
-    """The empty table."""
+    """The table without objects."""
 
     scene: Float[Array, "1 Hp Wp"]
     loglik_grid: Float[Array, "1 S P"]  # log p(image | empty, noise) up to a constant
@@ -40,7 +41,8 @@ def solo_gain_of(new: Placement, empty: Empty, context: Context, model: ImageMod
 
 
 def log_last(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
-    """log of k times the backward kernel: the chance that the object in slot `count` came last of the k = count + 1."""
+    """log of k times the backward kernel, for k = count + 1 objects: the chance that the object in slot `count`
+    came last."""
     present = jnp.arange(solo_gain.shape[1]) <= count
     share = jax.nn.softmax(jnp.where(present, -solo_gain, -jnp.inf), 1)
     share = (1 - SAMPLER.last_floor) * share + SAMPLER.last_floor * present / (count + 1)
@@ -48,7 +50,8 @@ def log_last(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Arr
 
 
 def log_order(solo_gain: Float[Array, "N M"], count: Int[Array, ""]) -> Float[Array, "N"]:
-    """log of the product of the kernels of all stages: how likely this order of `count` objects is, but a constant."""
+    """log of the product of the kernels of all stages, up to a constant: how likely this order of `count` objects
+    is."""
     slots = jnp.arange(solo_gain.shape[1])
     each = jax.vmap(log_last, (None, 0))(solo_gain, slots)
     return jnp.where((slots < count)[:, None], each, 0.0).sum(0)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The best scene's objects, known and unknown, as they are drawn and handed out."""
+"""The best scene's objects, known and unknown, as they are rendered and returned."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,8 @@ from bayes3d_ros.posterior.types import SceneSamples
 
 @dataclass(frozen=True)
 class BestScene:
-    """The sample that stands for all: its slots hold known objects first, then things of type `unknown_type`."""
+    """The sample that represents the posterior. Its slots hold known objects first, then things of type
+    `unknown_type`."""
 
     samples: SceneSamples
     summary: Summary
@@ -35,7 +36,7 @@ class BestScene:
         return kinds, poses, [k for k, _ in known]
 
     def _shown(self, seen: Observation) -> Int[np.ndarray, "h w"]:
-        """Labels, k + 1 of object k, of the things that scored pixels show; 0 where none is listed."""
+        """Which listed unknown thing each scored pixel shows: label k + 1 of object k, 0 for none."""
         kinds = self.samples.type[self.summary.reference]
         first = int((kinds >= 0).sum()) - len(self.things)
         labels = np.zeros(len(self.things) + 1, np.int32)
@@ -51,8 +52,8 @@ class BestScene:
         depth: Float[np.ndarray, "height width"],
         label: Int[np.ndarray, "height width"],
     ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
-        """Depth and labels of a rendered scene with the listed things in it: where one was seen, its depth is what
-        returned from it."""
+        """Depth and labels of a rendered scene with the listed unknown things added: where one was seen, its
+        depth is that of its returns."""
         if not self.things:
             return depth, label
         shown = resize_nearest(self._shown(seen), frame.intrinsics.width, frame.intrinsics.height)

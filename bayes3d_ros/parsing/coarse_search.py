@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The coarse level: score every (type, face, yaw, x, y) cell by a few samples of the object's surface.
+"""The coarse level of the search: score every (type, face, yaw, x, y) cell by a few samples of the object's surface.
 
-A sample is projected into the image. Where an unexplained return lies at its depth it counts for the hypothesis;
-where the camera sees past it, against; where something hides it, or nothing returned, it says nothing. Scores only
-choose where to look closer: they need not be right, and the sampler's weights are exact whatever they are.
+Each sample is projected into the image. It counts for the hypothesis where an unexplained return lies at its depth, and
+against it where the camera sees past it. It counts nothing where something hides it or nothing returned. Scores only
+choose where to look closer: they need not be right, and the sampler's weights are exact whatever the scores are.
 """
 
 from typing import NamedTuple
@@ -24,15 +24,15 @@ _CELLS_A_STEP = 4  # scored at once, beside all orientations: no result depends 
 
 
 class UnexplainedReturns(NamedTuple):
-    """What is left to explain: for each pixel its depth and how unexplained its return is (1 wholly, 0 not)."""
+    """For each pixel its depth, and how unexplained its return is (1 wholly, 0 not at all)."""
 
     depth: Float[Array, "H W"]
     unexplained: Float[Array, "H W"]
-    explained: Float[Array, "H W"]  # how well the scene explains the return; neither, where it is an outlier anyway
+    explained: Float[Array, "H W"]  # how well the scene explains the return; both are 0 for an outlier
 
 
 class CellsInReach(NamedTuple):
-    """Places on the table where an object's centre is looked for; the first `searched` of them."""
+    """Cells of the table in which the centre of an object is searched: the first `searched` of them."""
 
     centre: Float[Array, "C 2"]  # metres, in the table's frame
     distance: Float[Array, "C"]  # metres, to the nearest unexplained returns
@@ -49,8 +49,8 @@ def surface_score(
     penalty: float,
     points: int,
 ) -> Float[Array, "N"]:
-    """Rough gain in nats of adding an object; `tolerance` in metres of depth, `penalty` of a point that the camera sees
-    past, relative to the reward of one that matches; the first `points` samples are used."""
+    """Rough gain in nats of adding an object. tolerance: metres of depth; penalty: of a sample that the camera sees
+    past, relative to the reward of one that matches; points: number of samples used."""
     T = T_camera_object(placement, library, table)
     point, normal = _placed(T, placement.type, library, points)
     return _score(point, normal, _area(library, points)[placement.type], returns, image, tolerance, penalty)
@@ -88,7 +88,7 @@ def _score(
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "N"]:
-    """Rough gain in nats; `area` in metres^2 is what one of the points stands for."""
+    """Rough gain in nats; area: metres^2 that each sample stands for."""
     height, width = returns.depth.shape
     x, y, z = point
     facing = jnp.maximum(-(normal.x * x + normal.y * y + normal.z * z), 0.0) * jax.lax.rsqrt(x * x + y * y + z * z)
@@ -98,7 +98,7 @@ def _score(
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = jnp.clip(v, 0, height - 1) * width + jnp.clip(u, 0, width - 1)
     observed = returns.depth.ravel()[index]
-    # What nothing is known of neither matches nor speaks against.
+    # Pixels without a return count neither for nor against.
     known = jnp.where(seen & (observed > 0), facing * inverse**2, 0.0)
     gap = observed - z
     matched = jnp.maximum(1 - (gap / tolerance) ** 2, 0.0) * returns.unexplained.ravel()[index]
@@ -115,8 +115,8 @@ def cell_grid(table_size: tuple[float, float]) -> tuple[int, int]:
 def cells_to_search(
     returns: UnexplainedReturns, library: LibraryArrays, image: ScoredImage, table: Table, shape: tuple[int, int]
 ) -> CellsInReach:
-    """The cells that an object's centre may be in, given that it shows one of the unexplained returns: those nearest to
-    the returns first."""
+    """The cells that may hold an object's centre, if the object shows one of the unexplained returns. Cells nearest
+    to such returns come first."""
     xy = table_xy(returns.depth, image, table)
     index = jnp.floor((xy + table.size / 2) / SEARCH.cell).astype(jnp.int32)
     inside = ((index >= 0) & (index < jnp.array(shape))).all(-1)
@@ -126,7 +126,7 @@ def cells_to_search(
     size = 2 * SEARCH.gathered + 1
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
     apart = _distance((counts > 0) & (near >= SEARCH.fewest_unexplained))
-    # Those with the most returns first where the distance is the same.
+    # Of cells at the same distance, those with the most returns first.
     order = -apart + jnp.minimum(near, 1e3) * 1e-5
     best, where = jax.lax.top_k(order.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
     centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * SEARCH.cell - table.size / 2
@@ -137,14 +137,14 @@ def cells_to_search(
 
 
 def reach(library: LibraryArrays) -> Float[Array, "K 6"]:
-    """How far from one of its returns, along the table, the centre of an object may be, in metres: half a diagonal of
-    the face that it stands on, and what the corners of two cells add."""
+    """How far along the table, in metres, an object's centre may be from one of its returns: half a diagonal of the
+    face that it stands on, plus the diagonal of a cell."""
     return 0.5 * jnp.linalg.norm(library.face_size, axis=-1) + 2**0.5 * SEARCH.cell
 
 
 def _distance(source: Bool[Array, "X Y"]) -> Float[Array, "X Y"]:
-    """Of every cell to the nearest source, in metres; inf where there is none. Row by row, then column by column: all
-    pairs of a table of 10 m would take half a gigabyte."""
+    """Distance of every cell to the nearest source, in metres; inf without a source. Row by row, then column by
+    column: all pairs of cells of a table of 10 m would take half a gigabyte."""
     x, y = (jnp.arange(n, dtype=jnp.float32) for n in source.shape)
     nothing = jnp.full(source.shape, jnp.inf)
 
@@ -160,7 +160,7 @@ def _distance(source: Bool[Array, "X Y"]) -> Float[Array, "X Y"]:
 
 
 def table_xy(depth: Float[Array, "H W"], image: ScoredImage, table: Table) -> Float[Array, "H W 2"]:
-    """Where each return stands on the table."""
+    """x and y of each return in the table's frame."""
     R, t = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     point = [depth * image.ray_x[None, :] - t[0], depth * image.ray_y[:, None] - t[1], depth - t[2]]
     return jnp.stack([sum(R[a, b] * point[a] for a in range(3)) for b in range(2)], -1)
@@ -208,7 +208,7 @@ def _ways() -> tuple[Int[Array, "W"], Float[Array, "W"]]:
 
 
 def _area(library: LibraryArrays, points: int) -> Float[Array, "K"]:
-    """Metres^2 that one of the first `points` samples of a type stands for."""
+    """Metres^2 that each of the first `points` samples of a type stands for."""
     return library.surface_area * library.surface_point.shape[1] / points
 
 
@@ -251,8 +251,8 @@ def cells_in_turn(
 
 
 def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:
-    """How little the image says of something small in each cell: 1 where it would be hidden, falling with the number of
-    heights above the cell at which the camera sees past."""
+    """How little the image says about a small object in each cell: 1 where it would be hidden, less with each
+    height above the cell at which the camera sees past."""
     heights = jnp.array([0.01, 0.02, 0.035, 0.05, 0.07])
     x = (jnp.arange(shape[0]) + 0.5) * SEARCH.cell - table.size[0] / 2
     y = (jnp.arange(shape[1]) + 0.5) * SEARCH.cell - table.size[1] / 2

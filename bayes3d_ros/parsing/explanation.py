@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hold the best scene against the returns: how much of each object is where the scene puts it, and what else stands
+"""Compare the best scene with the returns: how much of each object is where the scene puts it, and what else stands
 there."""
 
 from typing import NamedTuple
@@ -15,15 +15,15 @@ from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.support_plane import BELOW_TABLE, connected_pieces
 from bayes3d_ros.posterior.types import UnexplainedPlace
 
-FEWEST_RETURNS = 30  # scored returns of a place that is told
+FEWEST_RETURNS = 30  # scored returns: the smallest place that is reported
 LEAST_HEIGHT = 0.01  # metres above the table from which a return can belong to a place
 SDS_OF_TABLE = 4.0  # the same, in standard deviations of the table's returns
 SDS_OF_NOISE = 3.0  # a return this near to a surface of the scene is where the scene puts it
-LEAST_APART = 0.01  # metres between a return and every surface of the scene beside it: it belongs to none
+LEAST_APART = 0.01  # metres from every surface of the scene beside it, from which a return belongs to none
 
 
 class Explanation(NamedTuple):
-    """What the scene makes of the scored returns."""
+    """What the scene explains of the scored returns."""
 
     explained: tuple[float, ...]  # of each object; NaN where nothing of it is in sight or nothing returned there
     unexplained: tuple[UnexplainedPlace, ...]  # most returns first
@@ -36,10 +36,11 @@ def explain(
     objects: int,
     noise: tuple[float, float],
 ) -> Explanation:
-    """Hold a rendered scene against the returns that were scored.
+    """Compare a rendered scene with the scored returns.
 
-    reconstruction: depth in metres, NaN where there is no surface; segmentation: 0 none, k + 1 for object k; both of
-    the camera's own size. noise: sigma of the depth noise in this scene, and the largest that the model considers.
+    reconstruction: depth in metres, NaN where there is no surface; segmentation: 0 none, k + 1 for object k; both
+    of the camera's own size. noise: sigma of the depth noise in this scene, and the largest that the model
+    considers.
     """
     height, width = seen.pixel_class.shape
     rendered, label = resize_nearest(reconstruction, width, height), resize_nearest(segmentation, width, height)
@@ -59,8 +60,8 @@ def _share(there: Bool[np.ndarray, "H W"], visible: Bool[np.ndarray, "H W"]) -> 
 def _beside_surface(
     depth: Float[np.ndarray, "H W"], rendered: Float[np.ndarray, "H W"], within: float
 ) -> Bool[np.ndarray, "H W"]:
-    """Whether a surface of the scene lies at a return's depth, in its pixel or one of the eight around: along outlines
-    a pixel shows what its neighbour is rendered as."""
+    """Whether a surface of the scene lies at a return's depth, in its pixel or one of the eight around it: along
+    outlines a pixel may show what its neighbour is rendered as."""
     around = np.pad(rendered, 1, constant_values=np.nan)
     belongs = np.zeros(depth.shape, bool)
     for v in range(3):
@@ -76,7 +77,7 @@ def _places(
     label: Int[np.ndarray, "H W"],
     belongs: Bool[np.ndarray, "H W"],
 ) -> tuple[UnexplainedPlace, ...]:
-    """Connected returns that stand above the table and belong to nothing."""
+    """Connected returns that stand above the table and belong to no surface of the scene."""
     T = seen.T_camera_table
     local = (unproject(depth, seen.camera) - T[:3, 3]) @ T[:3, :3]
     above = local[..., 2]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Metropolis-Hastings moves of one object of a scene, between the proposal and the target: a jump to where the object
-looks alike, a random walk, a fresh draw of the proposal."""
+"""Metropolis-Hastings moves of one object of a scene, on the path from the proposal to the target: a jump to a pose in
+which the object looks the same, a random walk, and a fresh draw from the proposal."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -20,7 +20,8 @@ Tree = TypeVar("Tree", bound=Any)
 
 
 def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
-    """A symmetric random walk in (x, y, yaw), as wide as one of the components of the same type and face, whichever."""
+    """A symmetric random walk in (x, y, yaw). Its width is that of a component of the same type and face, chosen at
+    random by weight."""
     choice, noise, size = jax.random.split(key, 3)
     count = placement.type.shape[0]
     same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
@@ -34,7 +35,8 @@ def walk(key: PRNGKeyArray, placement: Placement, modes: Modes) -> Placement:
 
 
 def jump(key: PRNGKeyArray, placement: Placement, library: LibraryArrays) -> Placement:
-    """To one of the poses in which the object looks alike, whichever. Each has a way back: this is symmetric."""
+    """To one of the poses in which the object looks the same, chosen uniformly. Each way has a way back, so the
+    jump is symmetric."""
     ways = library.alike_face.shape[2]
     way = jax.random.randint(key, placement.type.shape, 0, ways)
     type_id, face = jnp.maximum(placement.type, 0), jnp.maximum(placement.face, 0)
@@ -43,7 +45,7 @@ def jump(key: PRNGKeyArray, placement: Placement, library: LibraryArrays) -> Pla
 
 
 class Proposed(NamedTuple):
-    """N scenes of which one object is proposed and may move; `ancestor` is the scene of the others."""
+    """N scenes with one object that is proposed and may move. `ancestor` is the scene of the other objects."""
 
     ancestor: Int[Array, "N"]
     new: Placement  # [N]
@@ -66,8 +68,8 @@ def move_new(
     library: LibraryArrays,
     table: Table,
 ) -> Tree:
-    """Metropolis-Hastings of the new object under q^(1-b) target^b; at holds what `Proposed` does. `move`: 0 a jump to
-    where it looks alike, 1 a walk, 2 a fresh draw from q."""
+    """Metropolis-Hastings of the new object under q^(1-b) target^b. at: has the fields of `Proposed`. move: 0 a
+    jump to a pose in which it looks the same, 1 a walk, 2 a fresh draw from q."""
     draw_key, accept_key = jax.random.split(key)
     new = jax.lax.switch(
         move,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The fine levels: follow modes of the likelihood uphill, learn their shapes, and make a mixture that fits."""
+"""The fine levels of the search: follow modes of the likelihood uphill, learn their shapes, and fit a mixture to
+them."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -22,14 +23,14 @@ COMPONENTS = SEARCH.finalists * (1 + ALIKE)
 
 
 class Hypotheses(NamedTuple):
-    """Objects, with how far off in (x, y, yaw) each may be."""
+    """Objects, and how far off each may be in (x, y, yaw)."""
 
     placement: Placement  # [N]
     scale: Float[Array, "N 3 3"]  # lower Cholesky factor of the covariance
 
 
 class Pilots(NamedTuple):
-    """Draws that a mixture was fitted to, once they told what they could."""
+    """Draws to which a mixture was fitted. They are then used to plan the tempering, and thrown away."""
 
     placement: Placement  # [D]
     log_target: Float[Array, "D"]  # up to a constant
@@ -53,14 +54,14 @@ def factor(covariance: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
 
 
 def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
-    """Scales of a size that a mode may have: one that followed a ridge without end must not grow without end."""
+    """Scales bounded to sizes that a mode may have: a mode that follows an endless ridge must not grow without end."""
     scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(SEARCH.smallest_spread)), scale)
     excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(SEARCH.largest_spread)).max(1)
     return scale / jnp.maximum(excess, 1)[:, None, None]
 
 
 def widened(modes: Hypotheses) -> Hypotheses:
-    """Modes that another likelihood has elsewhere, by some `shared_spread`."""
+    """Modes widened by `shared_spread`, for a likelihood whose modes lie elsewhere by that much."""
     covariance = modes.scale @ modes.scale.swapaxes(1, 2) + jnp.diag(jnp.array(SEARCH.shared_spread) ** 2)
     return modes._replace(scale=factor(covariance))
 
@@ -84,9 +85,9 @@ def _move(placement: Placement, step: Float[Array, "M 3"]) -> Placement:
 def narrow(
     key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
 ) -> tuple[Hypotheses, Float[Array, "M"]]:
-    """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood, and their
-    best and their covariance serve the next round. `gains` maps hypotheses [N] to log likelihoods; returns the modes
-    and theirs."""
+    """Follow each mode uphill and learn its spread: draws about it are weighted by the tempered likelihood; the
+    best draw and the covariance start the next round. gains: maps hypotheses [N] to log likelihoods. Returns the
+    modes and their log likelihoods."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         placement, scale = state
@@ -96,7 +97,7 @@ def narrow(
         value = gains(jax.tree.map(jnp.ravel, _draw_about(placement, offset))).reshape(offset.shape[:2])
         value = jnp.maximum(value, -1e9)  # a mode outside the prior must not breed NaN
         weight = tempered(value, 5.0)
-        # About where the draws came from: a mode that is still on its way is drawn out along it (Hansen 2016, CMA-ES).
+        # Spread about the old centre: a mode that still moves is stretched along its way (Hansen 2016, CMA-ES).
         learned = jnp.einsum("md,mda,mdb->mab", weight, offset, offset)
         best = jnp.take_along_axis(offset, jnp.argmax(value, 1)[:, None, None], 1)[:, 0]
         floor = jnp.diag(jnp.array(SEARCH.smallest_spread) ** 2)
@@ -110,8 +111,8 @@ def narrow(
 def sharpen(
     key: PRNGKeyArray, start: Hypotheses, gains: Callable, draws: int, rounds: int
 ) -> tuple[Hypotheses, Float[Array, "M"]]:
-    """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature the
-    mode's covariance. Returns the modes and the best log likelihood met."""
+    """Fit a paraboloid to the log likelihood of draws about each mode: its top is the mode, its inverse curvature
+    the mode's covariance. Returns the modes, and the best log likelihood met near each."""
 
     def one_round(state: Hypotheses, key: PRNGKeyArray) -> tuple[Hypotheses, Float[Array, "M"]]:
         placement, scale = state
@@ -135,7 +136,7 @@ def sharpen(
         value_along = jnp.clip(value_along, 0.15, 1e4)
         top = jnp.einsum("mab,mb,mcb,mc->ma", along, 1 / value_along, along, slope)
         top = top / jnp.maximum(1, jnp.linalg.norm(top, axis=1, keepdims=True) / 2.5)
-        # Where the fit's top lies far from the best draw, trust the draw.
+        # If the fit's top lies far from the best draw, the draw is used.
         seen = jnp.take_along_axis(step, best[:, None, None], 1)[:, 0]
         off = jnp.einsum("mba,mb->ma", along, top - seen) ** 2 * value_along
         top = jnp.where((off.sum(1) > 12)[:, None], seen, top)
@@ -150,8 +151,8 @@ def sharpen(
 def adapt(
     key: PRNGKeyArray, modes: Modes, gains: Callable, library: LibraryArrays, table: Table
 ) -> tuple[Modes, Pilots]:
-    """Refit the mixture to weighted draws from itself until their weights are even enough. The draws are thrown away:
-    the sampler's own come after, so that nothing is chosen by its weight."""
+    """Refit the mixture to weighted draws from itself until their weights are even enough. These draws are thrown
+    away and the sampler draws anew, so that no draw is chosen by its weight."""
 
     def pilot(key: PRNGKeyArray, modes: Modes) -> tuple[Modes, Pilots, Array]:
         wide = modes._replace(scale=SEARCH.pilot_scale * modes.scale)
@@ -183,10 +184,11 @@ def adapt(
 
 
 def log_shares(mass: Float[Array, "M"], type_id: Int[Array, "M"]) -> Float[Array, "M"]:
-    """Log shares of draws for modes of these log masses and types: flatter than the masses, and flatter yet between
-    types. However many modes the likely type has, another of a few percent is drawn often enough to be weighed."""
+    """Log shares of draws for modes of these log masses and types: flatter than the masses, and flatter still
+    between types. However many modes the likeliest type has, another type of a few per cent is drawn often enough
+    to be weighed."""
     same = type_id[:, None] == type_id
-    mass = jnp.maximum(mass, mass.max() - 1e4)  # a type of which no pilot was drawn
+    mass = jnp.maximum(mass, mass.max() - 1e4)  # keeps types without pilots finite
 
     def of_type(value: Float[Array, "M"]) -> Float[Array, "M"]:
         return jax.nn.logsumexp(jnp.where(same, value, -jnp.inf), 1)
@@ -196,15 +198,15 @@ def log_shares(mass: Float[Array, "M"], type_id: Int[Array, "M"]) -> Float[Array
 
 
 def with_self_symmetry(modes: Modes, gains: Callable, library: LibraryArrays) -> Modes:
-    """Each component and the poses where its object looks alike (`self_symmetry.py`), sharing its weight by their log
-    likelihoods: a search that found one of them need not have found the others."""
+    """Each component, and copies at the poses in which its object looks the same (`self_symmetry.py`). They share
+    the component's weight by their log likelihoods: a search that found one pose need not have found the others."""
     at, scale = modes.centre, modes.scale
     face = jnp.concatenate([at.face[:, None], library.alike_face[at.type, at.face]], 1)
     shift = library.alike_shift[at.type, at.face]
     shift = jnp.concatenate([jnp.zeros_like(shift[:, :1]), shift], 1)
     centre = shifted(jax.tree.map(lambda a: jnp.broadcast_to(a[:, None], face.shape), at), face, shift)
     dx, dy = centre.x - at.x[:, None], centre.y - at.y[:, None]
-    # A turn of one carries the middle of the other around.
+    # When one pose turns, the centre of the other moves on a circle.
     zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
     rows = [jnp.stack(row, -1) for row in ((one, zero, -dy), (zero, one, dx), (zero, zero, one))]
     carried = jnp.einsum("maij,mjk->maik", jnp.stack(rows, -2), scale).reshape(-1, 3, 3)
@@ -215,8 +217,8 @@ def with_self_symmetry(modes: Modes, gains: Callable, library: LibraryArrays) ->
 
 
 def as_mixture(modes: Hypotheses, value: Float[Array, "M"]) -> Modes:
-    """A mixture of the modes, weighted by their log likelihoods and volumes. Flattened: the values are rough, and a
-    mode that is missed costs more than one that is tried in vain."""
+    """A mixture of the modes, weighted by their log likelihoods and volumes. Weights are flattened: the values are
+    rough, and a missed mode costs more than one that is tried in vain."""
     scale = SEARCH.inflation**0.5 * modes.scale
     log_volume = jnp.log(scale[:, 0, 0] * scale[:, 1, 1] * scale[:, 2, 2])
     log_weight = jax.nn.log_softmax((value + log_volume) / SEARCH.flatten)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Depth that neighbours agree on: where most returns are outliers, a few surface samples seldom meet a good one."""
+"""Depth on which neighbours agree. Where most returns are outliers, a few surface samples seldom meet a good one."""
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from bayes3d_ros.parsing.tuning import SEARCH
 def neighbour_depth(
     depth: Float[Array, "H W"], pixel_class: Int[Array, "H W"]
 ) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
-    """For each pixel the depth and kind of that return about it which most of the others lie near; depth 0, unknown,
-    where fewer than three agree."""
+    """For each pixel, depth and class of the return in its neighbourhood that most other returns lie near; depth 0,
+    unknown, where fewer than three agree."""
     height, width = depth.shape
     size = 2 * SEARCH.consensus_reach + 1
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a depth frame to the image that is scored: the table in it, and which returns belong to the workspace."""
+"""From a depth frame to the image that is scored: find the table, and decide which returns belong to the workspace."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ class Observation(NamedTuple):
     """What the model is given of a frame."""
 
     image: ScoredImage
-    errors: SharedErrorImage | None  # of `likelihood: depth`
+    errors: SharedErrorImage | None  # None unless `likelihood: depth`
     table: Table
     camera: Intrinsics  # of the image as it is scored; depth and pixel_class have its size
     depth: Float[np.ndarray, "height width"]  # metres, 0 where there is no return
@@ -42,8 +42,8 @@ class Observation(NamedTuple):
 
 
 def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
-    """Reduce a frame to the image that is scored, and find the table in it. Raises ParseError where nothing returned in
-    range, or no table is in sight."""
+    """Reduce a frame to the image that is scored, and find the table in it. Raises ParseError if nothing returned
+    in range, or if no table is in sight."""
     camera, depth, in_range, returned = reduced(frame, settings.score_width, settings.near, settings.far)
     if not in_range.any():
         raise ParseError(
@@ -70,8 +70,8 @@ def table_of(T_camera_table: Float[np.ndarray, "4 4"], settings: ParserSettings)
 
 
 def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, SharedErrorImage | None, Table]:
-    """A made-up image of a bare table, as a camera 0.8 m above it sees it whose images have this size. Scoring it
-    compiles all that a frame needs, and takes no search."""
+    """A made-up image of a bare table, seen by a camera 0.8 m above it whose images have this size. Scoring it
+    compiles everything that a frame needs, without a search."""
     across, down = scored_size(width, height, settings.score_width)
     camera = Intrinsics(float(across), float(across), (across - 1) / 2, (down - 1) / 2, across, down)
     above, c, s = 0.8, np.cos(0.6), np.sin(0.6)
@@ -104,7 +104,9 @@ def _as_scored(
     bare = np.where(pixel_class != BEYOND, depth_of_table(camera.rays(), T_camera_table, settings.far), np.inf)
     shared = settings.shares_errors
     likelihood = Likelihood("points" if settings.likelihood == "points" else "independent")
-    weight = np.float32(SEARCH.pixel_weight if shared else 1.0)  # of shared errors only the search scores pixels alone
+    weight = np.float32(
+        SEARCH.pixel_weight if shared else 1.0
+    )  # under shared errors only the search scores pixels alone
     near, far, sigma_max = settings.near, settings.far, settings.sigma_max
     image = scored_image(camera, depth, pixel_class, bare, near, far, sigma_max, likelihood=likelihood, weight=weight)
     return image, shared_error_image(image, amplitudes_of(settings), sigma_max) if shared else None

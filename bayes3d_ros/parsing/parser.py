@@ -54,12 +54,12 @@ class SceneParser:
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Names of types: the library's, and `unknown` where there may be such things."""
+        """Names of types: the library's, then `unknown` if the settings allow such things."""
         return type_names(self.library, self.settings.knows_unknown)
 
     def compiled_for(self, width: int, height: int) -> bool:
-        """Whether parsing an image of this size needs no compilation, which takes tens of seconds. So it is after
-        `warm_up`, and after a frame of which two or more objects were found."""
+        """Whether parsing an image of this size needs no compilation, which takes tens of seconds. It needs
+        none after `warm_up`, and after a frame in which two or more objects were found."""
         return array_shape(width, height, self.settings.score_width) in self._compiled
 
     def warm_up(self, width: int, height: int) -> None:
@@ -76,7 +76,7 @@ class SceneParser:
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
     def parse(self, frame: DepthFrame) -> ScenePosterior:
-        """The posterior given one frame. Raises ParseError with one clear line when there is none."""
+        """The posterior given one frame. Raises ParseError, one line, if there is none."""
         start = time.perf_counter()
         settings = self.settings
         seen = observe(frame, settings)
@@ -125,7 +125,8 @@ class SceneParser:
     def _sample(
         self, key: PRNGKeyArray, context: Context, model: ImageModel, seen: Observation | None = None
     ) -> tuple[list[Stage], list[float]]:
-        """Stages of the sampler, from the empty table to more known objects than the image bears out."""
+        """Stages of the sampler, from the empty table to one number of known objects more than the image
+        supports."""
         settings = self.settings
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
@@ -166,8 +167,8 @@ class SceneParser:
     def _refreshed(
         self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, model: ImageModel
     ) -> smc.Population:
-        """The likeliest number of objects, with some of them moved; a single one has been, as far as it can be without
-        tempering."""
+        """The stage with the most likely number of objects, after some of its objects were moved by MCMC. A
+        single object is moved only with tempering: its own stage has moved it already."""
         settings = self.settings
         if count < 2 and not (count and settings.tempering_steps):
             return state
@@ -188,8 +189,8 @@ class SceneParser:
         seen: Observation | None,
         matters: bool = True,
     ) -> Stage:
-        """A stage's scenes of `count` known objects, with what else stands there; only its evidence where they do not
-        matter."""
+        """The scenes of `count` known objects, with noise and unknown things sampled. If the stage's posterior
+        mass is negligible (`matters` is false), only its evidence is kept."""
         if not matters:
             return Stage.without_scenes(float(state.log_evidence), state.objects.x.shape[1])
         noise = self._sample_noise(key, model, state.loglik_grid)
@@ -202,7 +203,7 @@ class SceneParser:
         return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
 
     def _with_things(self, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation) -> Stage:
-        """The stage's scenes with things of no type in them."""
+        """The stage's scenes with unknown things added."""
         settings = self.settings
         half = settings.window // 2
         fixed = settings.fixed_objects >= 0
@@ -225,8 +226,8 @@ class SceneParser:
     def _mix(
         self, stages: list[Stage], seen: Observation
     ) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
-        """The mixture over the number of known objects, log p(image) - log p(image | empty), and of each sample what is
-        of no type in the library."""
+        """The mixture over the number of known objects, log p(image) - log p(image | empty), and the unknown
+        things of each sample."""
         settings = self.settings
         known = np.log1p(-settings.unknown_probability) if settings.knows_unknown else 0.0
         log_prior = np.arange(len(stages)) * (np.log(settings.count_ratio) + known)
@@ -253,7 +254,7 @@ class SceneParser:
 
 
 def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M1 3"]:
-    """Standard normal numbers for the table and each object of every scene."""
+    """Standard normal numbers for the errors of the table and of each object, for every scene."""
     return jax.random.normal(key, (shape[0], shape[1] + 1, 3))
 
 

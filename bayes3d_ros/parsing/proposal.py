@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The proposal's density: a mixture of Student t components about the modes that the search found, and a floor.
+"""The proposal: a mixture of Student t components about the modes that the search found, and a floor over other places.
 
-Components overlap where they will; the density of a proposed object is that of the whole mixture, summed over every
-component that could have made it, so it is exact however the components were found.
+Components may overlap. The density of a proposed object is that of the whole mixture, summed over all components that
+could have made it, so it is exact however the components were found.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.sampling import student_t
 
-_TURNS = 4  # either way, in which a component reaches around the circle: of one as wide as may be 0.05 % goes farther
+_TURNS = 4  # turns either way that a component's tails are followed: of the widest component 0.05 % goes farther
 
 
 class Modes(NamedTuple):
@@ -31,7 +31,7 @@ class Modes(NamedTuple):
 
 class Proposal(NamedTuple):
     modes: Modes
-    cells: Float[Array, "X Y"]  # probability of each cell of the table, for what could hide there
+    cells: Float[Array, "X Y"]  # probability of each cell of the table: where an object could hide
     shares: Float[Array, "3"]
 
 
@@ -58,7 +58,7 @@ def draw_modes(key: PRNGKeyArray, modes: Modes, count: int) -> Placement:
 
 
 def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryArrays, table: Table) -> Placement:
-    """`count` objects; yaw in [0, 2 pi)."""
+    """`count` objects from the whole proposal; yaw in [0, 2 pi)."""
     keys = jax.random.split(key, 8)
     mode = draw_modes(keys[0], proposal.modes, count)
     type_id = jax.random.randint(keys[1], (count,), 0, library.num_types)
@@ -80,7 +80,7 @@ def log_density_modes(placement: Placement, modes: Modes) -> Float[Array, "N M"]
     same = (placement.type[:, None] == modes.centre.type) & (placement.face[:, None] == modes.centre.face)
     L = modes.scale
     log_determinant = jnp.log(jnp.abs(L[:, 0, 0] * L[:, 1, 1] * L[:, 2, 2]))
-    # A wide component reaches around the circle.
+    # Tails of a wide component wrap around the circle.
     terms = [
         student_t.log_density((whitened(placement, modes, turn) ** 2).sum(-1), 3, SEARCH.freedom, log_determinant)
         for turn in 2 * np.pi * np.arange(-_TURNS, _TURNS + 1)
@@ -89,7 +89,7 @@ def log_density_modes(placement: Placement, modes: Modes) -> Float[Array, "N M"]
 
 
 def whitened(placement: Placement, modes: Modes, turn: float = 0.0) -> Float[Array, "N M 3"]:
-    """Objects seen from every component, in units of its scale: L^-1 (x - centre), yaw wrapped and `turn` added."""
+    """Objects in units of each component's scale: L^-1 (x - centre), with yaw wrapped and `turn` added."""
     L, centre = modes.scale, modes.centre
     a = (placement.x[:, None] - centre.x) / L[:, 0, 0]
     b = (placement.y[:, None] - centre.y - L[:, 1, 0] * a) / L[:, 1, 1]
@@ -98,8 +98,8 @@ def whitened(placement: Placement, modes: Modes, turn: float = 0.0) -> Float[Arr
 
 
 def refit(placement: Placement, weight: Float[Array, "N"], modes: Modes) -> Modes:
-    """One step of population Monte Carlo (Cappe et al. 2008): weighted EM of the t mixture on draws from it. Components
-    that hold too few draws keep their shape."""
+    """One step of population Monte Carlo (Cappe et al. 2008): weighted EM of the t mixture, on draws from it.
+    Components with too few draws keep their shape."""
     nu = SEARCH.freedom
     share = jax.nn.softmax(log_density_modes(placement, modes), 1) * weight[:, None]
     held = share.sum(0)

@@ -33,8 +33,8 @@ def render_scene(
     far: float,
     library: LibraryArrays,
 ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
-    """Depth in metres of the table, up to `far`, and of objects on it, NaN where there is no surface; and labels, 0
-    where there is no object, k + 1 where the k-th is seen."""
+    """Depth in metres of the table, up to `far`, and of the objects on it, NaN where there is no surface; and
+    labels: 0 where there is no object, k + 1 where the k-th is seen."""
     rays = camera.rays()
     depth = depth_of_table(rays, T_camera_table, far).astype(np.float32)
     labels = np.zeros(depth.shape, np.uint16)

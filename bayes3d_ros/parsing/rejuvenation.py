@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Moves of objects that earlier stages placed, under the posterior of the whole scene.
+"""MCMC moves of objects that earlier stages placed, under the posterior of the whole scene.
 
 A population that is resampled stage by stage ends with few ancestors, and an object that was placed before its
-neighbours were known need not fit beside them. So objects are taken in turn, with everything else held, along the path
-q^(1-b) target^b: b falls from 1 and rises again, as far as `Effort` says, with Metropolis-Hastings moves and resampling
-on the way, and last come moves at b = 1. q is the proposal of the object's own stage, the target that of the
-sampler's lists, p_k times the backward kernels of all stages. Weighted scenes stay weighted scenes of the target (Del
-Moral et al. 2006, along the tempered path of Neal 1996); the evidence stays as the stages estimated it.
+neighbours were known need not fit beside them. So objects are moved one after the other, with everything else held
+fixed, along the path q^(1-b) target^b. The exponent b falls from 1 and rises again, as far as `Effort` says, with
+Metropolis-Hastings moves and resampling at every step; moves at b = 1 come last. q is the proposal of the object's own
+stage. The target is that of the sampler, over ordered lists: p_k times the backward kernels of all stages. Weighted
+scenes remain weighted scenes of the target (Del Moral et al. 2006, along the tempered path of Neal 1996); the evidence
+remains as the stages estimated it.
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from bayes3d_ros.parsing.search import conflicts
 from bayes3d_ros.parsing.tuning import SAMPLER
 from bayes3d_ros.sampling.resampling import distinct_fraction, normalised, resample
 
-_ORDER_CLEAR_NATS = 60.0  # nats between objects' own gains, beyond which a move does not change which came last
+_ORDER_CLEAR_NATS = 60.0  # nats between the objects' own gains, beyond which a move cannot change which one came last
 
 
 class WeightedScenes(NamedTuple):
@@ -55,8 +56,8 @@ class GivenFrame(NamedTuple):
 
 
 class Effort(NamedTuple):
-    turns: Int[Array, ""]  # objects taken
-    heats: Int[Array, ""]  # steps down to the least exponent, 0.7^heats
+    turns: Int[Array, ""]  # number of objects to move
+    heats: Int[Array, ""]  # steps down to the smallest exponent, 0.7^heats
 
 
 def rejuvenate(
@@ -67,8 +68,8 @@ def rejuvenate(
     frame: GivenFrame,
     effort: Effort,
 ) -> WeightedScenes:
-    """Move as many objects as there are turns: first that of which the fewest placements are left, then the others;
-    proposals [M], of each slot's stage."""
+    """Move `effort.turns` objects: first the one with the fewest distinct placements, then the following slots.
+    proposals [M]: of the stage of each slot."""
     slots = state.objects.type.shape[1]
     left = jnp.stack([distinct_fraction(_slot(state.objects, m).x, state.log_weight) for m in range(slots)])
     first = jnp.argmin(jnp.where(jnp.arange(slots) < count, left, jnp.inf))
@@ -94,7 +95,7 @@ def _move(
     frame: GivenFrame,
     heats: Int[Array, ""],
 ) -> WeightedScenes:
-    """The object in slot m of every scene."""
+    """Move the object in slot m of every scene."""
     context, model, empty, window, overlap_limit, _ = frame
     _, library, table = context
     particles, slots = state.solo_gain.shape
@@ -103,7 +104,7 @@ def _move(
     without = _scenes_without(state, m, count, frame)
     gap = jnp.abs(state.solo_gain - jnp.take_along_axis(state.solo_gain, m[None, None], 1))
     unclear = jnp.where(others & (jnp.arange(slots) < count), gap, jnp.inf).min() < _ORDER_CLEAR_NATS
-    # Behind the last slot: not among those that an object may conflict with.
+    # The object's own slot holds the last object, so that the first count - 1 slots are those it may conflict with.
     rest = jax.tree.map(lambda a: a.at[:, m].set(a[:, count - 1]), state.objects)
 
     everyone, mine = jnp.arange(particles), _slot(state.objects, m)
@@ -164,7 +165,8 @@ def _heat_and_cool(
     heats: Int[Array, ""],
     frame: GivenFrame,
 ) -> tuple[Proposed, Float[Array, "N"]]:
-    """From weighted draws of the target, down to the least exponent and up again, to others with their log weights."""
+    """From weighted draws of the target, down to the smallest exponent and up again, to new weighted draws and
+    their log weights."""
     _, library, table = frame.context
 
     def step(number: Array, carry: tuple) -> tuple:

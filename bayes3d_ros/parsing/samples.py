@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the sampler's stages, one a number of objects, to the weighted scenes that are handed out."""
+"""From the sampler's stages, one for each number of objects, to the weighted scenes that the parser returns."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,17 +26,17 @@ class Stage(NamedTuple):
     objects: Placement
     gauss: Float[
         np.ndarray, "N M1 3"
-    ]  # standard normal: of the table's two tilts and height, then of each object's picture
+    ]  # standard normal: for the table's two tilts and height, then for each object's picture
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
     log_evidence: float
-    things: list[tuple[UnknownThing, ...]]  # of each scene, what is of no type in the library
+    things: list[tuple[UnknownThing, ...]]  # unknown things of each scene
     lineage: Int[np.ndarray, "N M"]  # which draw of its stage an object descends from
 
     @classmethod
     def without_scenes(cls, log_evidence: float, slots: int) -> "Stage":
-        """A stage whose scenes do not matter: only its evidence."""
+        """A stage whose scenes have negligible weight: only its evidence is kept."""
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
@@ -53,8 +53,9 @@ def mixture(
     seen: SeenTable,
     outline: float,
 ) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
-    """The mixture of stages of so many known objects, p(n | image) ~ P(n) Z_n; log p(image) - log p(image | empty); and
-    of each sample what is of no type. outline: standard deviation of where an object's picture stands, as a slope."""
+    """The mixture of the stages, p(n | image) ~ P(n) Z_n; log p(image) - log p(image | empty); and the unknown
+    things of each sample. counts: numbers of known objects of the stages; outline: standard deviation of the
+    displacement of an object's picture, as an angle's tangent."""
     log_z = np.array([s.log_evidence for s in stages])
     log_evidence = np.logaddexp.reduce(log_prior + log_z)
     log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
@@ -64,7 +65,7 @@ def mixture(
     objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
     things = [held for s in stages for held in s.things]
     things = [things[k] for k in keep] if things else [()] * len(keep)
-    # Each scene twice, with errors of either sign: means stay where they are.
+    # Each scene twice, with errors of opposite signs, so that means do not move.
     gauss = np.concatenate([s.gauss for s in stages])[keep]
     gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None, None]
     lineage = _apart([s.lineage for s in stages])[keep]
@@ -102,7 +103,7 @@ def mixture(
 
 
 def _apart(lineages: Sequence[Int[np.ndarray, "_ M"]]) -> Int[np.ndarray, "N M"]:
-    """Lineages of all stages, so numbered that no two stages share one."""
+    """Lineages of all stages, renumbered so that no two stages share a number."""
     first = np.cumsum([0, *(int(lineage.max(initial=0)) + 1 for lineage in lineages)])
     return np.concatenate([lineage + start for lineage, start in zip(lineages, first, strict=False)])
 
@@ -110,8 +111,8 @@ def _apart(lineages: Sequence[Int[np.ndarray, "_ M"]]) -> Int[np.ndarray, "N M"]
 def _draws(
     lineage: Int[np.ndarray, "S M0"], held: Bool[np.ndarray, "S M"], known: Int[np.ndarray, "S"]
 ) -> Int[np.ndarray, "S M"]:
-    """The draw of every object: its lineage, of the first `known` ones; of a thing of no type its scene, of which there
-    are two samples each. -1 in empty slots."""
+    """The draw of every object, -1 in empty slots. For the first `known` objects it is the lineage; for an unknown
+    thing it is the scene, of which there are two samples each."""
     scene = int(lineage.max(initial=0)) + 1 + np.arange(len(held)) // 2
     draw = np.repeat(scene[:, None], held.shape[1], 1)
     own = np.arange(lineage.shape[1]) < known[:, None]
@@ -122,11 +123,13 @@ def _draws(
 def _beside_pictures(
     pictures: Placement, gauss: Float[np.ndarray, "S M 3"], library: LibraryArrays, table: Table, outline: float
 ) -> Placement:
-    """Objects, given their pictures.
+    """Objects, drawn given their pictures.
 
-    The likelihood is of the picture: where outlines and surfaces are seen. All outlines of an object are displaced
-    together: on the table by N(0, (outline depth)^2) along x and y, and by as much of a turn as moves its corners so
-    far. The prior is flat, so an object given its picture is a normal about it, whatever the image."""
+    The likelihood is of an object's picture: where its outline and surface are seen. The camera displaces all
+    outlines of an object together: on the table by N(0, (outline depth)^2) along x and y, and by as much of a turn
+    as moves its corners so far. The prior is flat, so the object given its picture is normal about it, whatever the
+    image.
+    """
     T = np.asarray(table.T_camera_table, np.float64)
     depth = T[2, 0] * pictures.x + T[2, 1] * pictures.y + T[2, 3]
     size = np.asarray(library.face_size, np.float64)[pictures.type.clip(0), pictures.face.clip(0)]
@@ -152,7 +155,7 @@ def _with_things(
     unknown_type: int,
     T_camera_table: Float[np.ndarray, "S 4 4"],
 ) -> _Slots:
-    """Things of no type in the slots after the known objects of each sample."""
+    """Unknown things are added to the slots after the known objects of each sample."""
     most = max((len(t) for t in things), default=0)
     needed = max((int(n) + len(t) for n, t in zip(count, things, strict=True)), default=0)
     grown = max(needed, known.type.shape[1])
@@ -167,7 +170,7 @@ def _with_things(
     for s, held in enumerate(things):
         for k, thing in enumerate(held):
             slot = int(count[s]) + k
-            # Shares of how far a thing goes on behind, evenly over the samples (the golden ratio's multiples).
+            # Shares of how far a thing extends behind, spread evenly over the samples (multiples of the golden ratio).
             size[s, slot], centre, yaw = drawn_box(thing, (0.6180339887 * s + 0.31 * k) % 1)
             kind[s, slot] = unknown_type
             T[s, slot] = T_camera_table[s] @ slide(*(np.array(a) for a in (*centre, yaw)))
@@ -183,6 +186,6 @@ def _moved(table_error: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 1 4 4"
 
 
 def _T_table_object(objects: Placement, library: LibraryArrays) -> Float[np.ndarray, "S M 4 4"]:
-    """In float64 numpy: sample counts differ from frame to frame, and must not recompile."""
+    """In float64 and numpy: the number of samples differs from frame to frame, and must not cause a compilation."""
     T_contact = np.asarray(library.T_contact_object, np.float64)[objects.type.clip(0), objects.face.clip(0)]
     return slide(*(np.asarray(a) for a in (objects.x, objects.y, objects.yaw))) @ T_contact

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the whole space of one object to a proposal: cells scored by surface samples, the best of them aligned to the
-data, the best of those scored with the model itself and narrowed round by round.
+"""From the whole space of one object to a proposal: cells scored by surface samples; the best cells aligned to the
+data; the best of those scored with the model itself, and followed uphill.
 
-It takes the place of the coarse-to-fine proposal of Bayes3D (Methodology, B): `docs/model.md` says what differs."""
+It takes the place of the coarse-to-fine proposal of Bayes3D (Methodology, B): docs/departures.md says what differs, and
+why; docs/inference.md lists the levels.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -47,14 +49,15 @@ from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, wrap
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.tempering import exponents
 
-_CROWDED_OUT_NATS = 1e6  # more than any gain differs by: what is set back by so much comes last
+_CROWDED_OUT_NATS = 1e6  # more than any two gains differ by: hypotheses lowered by this come last
 
 
 Gains = Callable[[Placement], Float[Array, "N"]]  # log likelihoods that objects [N] gain
 
 
 class LeadScene(NamedTuple):
-    """A scene that stands for the population: its depth image, its log likelihood on the grid of noise, its objects."""
+    """The scene that represents the population in the search: its depth image, its log likelihoods on the grid of
+    noise, its objects."""
 
     depth: Float[Array, "Hp Wp"]  # padded
     loglik_grid: Float[Array, "S P"]
@@ -63,12 +66,18 @@ class LeadScene(NamedTuple):
 
 
 def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, noise: Noise) -> UnexplainedReturns:
-    """Returns in the workspace that stand in front of the scene by more than noise are unexplained. What the scene
-    explains, and what lies beyond the workspace, is kept as a witness of free space; a return far behind the scene is
-    an outlier whatever is added, and no witness. Where most returns are outliers, it is their consensus that counts."""
+    """Which returns the scene explains.
+
+    Returns in the workspace that stand in front of the scene by more than noise are unexplained. Returns that the
+    scene explains, and returns beyond the workspace, are witnesses of free space. A return far behind the scene is
+    an outlier whatever is added, and no witness. Where most returns are outliers, their consensus takes their
+    place.
+    """
     many = noise.p_outlier[0] > SEARCH.many_outliers
     depth, pixel_class = jax.lax.cond(many, neighbour_depth, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
-    if image.rows is not None:  # below the camera's last row the returns above it would agree on something
+    if (
+        image.rows is not None
+    ):  # rows below the camera's last one have no returns; those above would lend them a consensus
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth
     apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
@@ -78,7 +87,8 @@ def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, no
 
 
 def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
-    """Whether an object interpenetrates any of the first `count` others; placement [N], others [N, M]."""
+    """Whether an object interpenetrates any of the first `count` others by more than `limit`; placement [N], others
+    [N, M]."""
 
     def with_other(m: Int[Array, ""], worst: Float[Array, "N"]) -> Float[Array, "N"]:
         share = overlap(placement, jax.tree.map(lambda a: a[:, m], others), library)
@@ -88,7 +98,7 @@ def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], 
 
 
 def _distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
-    """Scores, with those of near-copies of a better hypothesis set to -inf. Sorted by falling score beforehand."""
+    """Scores, with -inf for near-copies of a better hypothesis. Hypotheses are sorted by falling score."""
     same = (placement.type[:, None] == placement.type) & (placement.face[:, None] == placement.face)
     close = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y) < near[0]
     close &= jnp.abs(wrap(placement.yaw[:, None] - placement.yaw)) < near[1]
@@ -97,9 +107,12 @@ def _distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float,
 
 
 def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
-    """Scores, with all but the `most` best of any place set behind the others, and those of a type there lowered by
-    `repeated_nats` for each that is better: what is seen best must crowd out neither what stands elsewhere nor another
-    type of a few percent. Sorted by falling score beforehand."""
+    """Scores, lowered for all but the `most` best hypotheses of a place, which come after all others.
+
+    Within a place, each hypothesis is also lowered by `repeated_nats` for every better one of its type. So what is
+    seen best crowds out neither objects elsewhere nor another type of a few per cent. Hypotheses are sorted by
+    falling score.
+    """
     apart = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y)
     close = apart < library.radius[placement.type]
     before = jnp.tril(close & jnp.isfinite(score), -1)
@@ -109,8 +122,8 @@ def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArray
 
 
 def _best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int, most_types: int) -> Bool[Array, "N"]:
-    """Which are among the `each` best of their type, for the `most_types` types whose best are best. What explains a
-    few returns best may be any type, and many poses of one must not crowd out the others."""
+    """Which hypotheses are among the `each` best of their type, for the `most_types` types with the best best
+    hypothesis. A few returns may belong to any type, and many poses of one type must not crowd out the others."""
     better = (score[:, None] < score) | ((score[:, None] == score) & jnp.tril(jnp.ones((len(score),) * 2, bool), -1))
     same = type_id[:, None] == type_id
     best_of_type = ~(better & same).any(1)
@@ -122,7 +135,8 @@ def _best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int
 def candidates(
     scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int], overlap_limit: float
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
-    """The coarse levels: scored cells, the best of them aligned, near-copies and impossible ones dropped."""
+    """The coarse levels: cells are scored, the best are aligned, and near-copies and impossible hypotheses are
+    dropped."""
     image, library, table = context
     cells = cells_to_search(returns, library, image, table, shape)
     scores = score_cells(cells, returns, image, library, table)
@@ -164,7 +178,7 @@ def candidates(
 def _gains(
     placement: Placement, depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int
 ) -> Float[Array, "N"]:
-    """Log likelihood gained over one scene at one noise level; -inf outside the prior."""
+    """Log likelihood gained over one scene, at one noise level; -inf outside the prior."""
     ancestor = jnp.zeros(placement.type.shape, jnp.int32)
     gain = log_likelihood_gain(placement, ancestor, depth[None], *context, noise, window)[:, 0, 0]
     return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), gain, -jnp.inf)
@@ -179,8 +193,8 @@ def find_proposal(
     window: int,
     overlap_limit: float,
 ) -> tuple[Proposal, Float[Array, "L"]]:
-    """The proposal for one more object, given the scene that stands for the population, and the exponents by which to
-    go from it to the target."""
+    """The proposal for one more object, given the scene that represents the population; and the exponents of the
+    path from the proposal to the target."""
     image, library, table = context
     noise = likeliest_noise(model, scene.loglik_grid)
     height, width = image.depth.shape
@@ -207,8 +221,8 @@ def find_proposal(
 
 
 def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int) -> Gains:
-    """Gains over a scene at a noise that is no smaller than `least_sigma`. At half the resolution a sliver of an object
-    has too few pixels."""
+    """Gains over a scene, with a sigma of at least `least_sigma`, at the image's resolution: at half of it, a
+    sliver of an object has too few pixels."""
     blurred = noise._replace(sigma=jnp.maximum(noise.sigma, SEARCH.least_sigma))
 
     def rough(placement: Placement) -> Float[Array, "N"]:
@@ -220,7 +234,7 @@ def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, w
 def _starts(
     found: Hypotheses, score: Float[Array, "C"], rough: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, ""]]:
-    """The hypotheses to follow uphill for a little, and the gain of the best."""
+    """The hypotheses to follow uphill for a little, and the gain of the best one."""
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), len(score))
     chosen = _types_first(
         found, gain, SEARCH.starts_apart, (SEARCH.early_a_type, SEARCH.start_types), SEARCH.starts, library
@@ -236,8 +250,9 @@ def _types_first(
     others: int,
     library: LibraryArrays,
 ) -> Hypotheses:
-    """So many of each of so many types, those whose best are best, and so many others, whatever their type. `near`:
-    metres and radians within which two of a type and face are copies. Sorted by falling value beforehand."""
+    """The best `each` of `types` types, those with the best best hypothesis, and `others` more of any type. near:
+    metres and radians within which two hypotheses of a type and face are copies. Hypotheses are sorted by falling
+    value."""
     each, types = of_types
     value = _distinct(modes.placement, value, near)
     first = _best_of_types(modes.placement.type, value, each, types)
@@ -254,7 +269,7 @@ def _searched(
     model: ImageModel,
     window: int,
 ) -> tuple[Modes, Pilots]:
-    """A mixture about the modes that are uphill of what was found, and the pilots that it was fitted to."""
+    """A mixture about the modes uphill of the hypotheses, and the pilots to which it was fitted."""
     _, library, table = context
     early_key, narrow_key, sharpen_key, adapt_key, model_key = jax.random.split(key, 5)
     # A pose that is right but for a centimetre may gain less than a wrong one that was aligned well: each is followed a
@@ -283,9 +298,13 @@ def _searched(
 def _targets(
     first: Placement, scene: LeadScene, context: Context, model: ImageModel, window: int
 ) -> tuple[Gains, Gains]:
-    """What modes are fitted to (where pixels err alone: at one noise level), and what the sampler's weights will hold:
-    the errors' parameters integrated out. Modes that explain different parts of the image are compared by thousands of
-    nats; at one noise level that comparison is off by ten. first [1]: what explains what there is to explain."""
+    """Two functions of placements: the one that modes are fitted to, and the one that the sampler's weights use,
+    with the parameters of errors integrated out.
+
+    With independent pixels the first is at one noise level; under shared errors both are the second. Modes that
+    explain different parts of the image differ by thousands of nats, and at one noise level this difference is off
+    by ten. first [1]: the hypothesis that explains most.
+    """
     if not isinstance(model, NoiseGrid):
         both = _marginal_gains(model, scene.loglik_grid, scene, context, window)
         return both, both
@@ -305,8 +324,8 @@ def _targets(
 def _marginal_gains(
     model: ImageModel, loglik_grid: Float[Array, "S P"], scene: LeadScene, context: Context, window: int
 ) -> Gains:
-    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out;
-    loglik_grid: the scene's at these nodes."""
+    """Log likelihoods of the scene with one more object, with the nodes of a model, or of a part of it, integrated
+    out. loglik_grid: log likelihoods of the scene at these nodes."""
 
     def marginal(placement: Placement) -> Float[Array, "N"]:
         ancestor = jnp.zeros(placement.type.shape, jnp.int32)
@@ -317,7 +336,7 @@ def _marginal_gains(
 
 
 def _not_searched(found: Hypotheses, library: LibraryArrays) -> tuple[Modes, Pilots]:
-    """A mixture and pilots of the same shapes, which nothing uses."""
+    """A mixture and pilots of the shapes that `_searched` returns; nothing uses them."""
     modes = as_mixture(take(found, slice(SEARCH.finalists)), jnp.zeros(SEARCH.finalists))
     mixture = with_self_symmetry(modes, lambda placement: jnp.zeros(placement.type.shape), library)
     nobody = jax.tree.map(lambda a: jnp.zeros(SEARCH.pilot_draws, a.dtype), found.placement)

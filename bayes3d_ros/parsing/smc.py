@@ -56,7 +56,7 @@ class Population(NamedTuple):
 
 
 class StageInfo(NamedTuple):
-    """What happened in a stage."""
+    """Diagnostics of a stage."""
 
     ess: Float[Array, ""]  # fraction, before resampling: the least of the stage's steps
 
@@ -163,7 +163,7 @@ def step(
 def _own_gain(
     end: Proposed, state: Population, count: Int[Array, ""], context: Context, model: ImageModel, window: int
 ) -> Float[Array, "N"]:
-    """Nats that each new object alone gains over the empty table."""
+    """Nats that each new object gains alone over the empty table."""
     return jax.lax.cond(
         count == 0,
         lambda: end.log_likelihood - state.log_likelihood[end.ancestor],
@@ -193,9 +193,9 @@ def refresh(
 
 
 def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
-    """From draws of the proposal, of which there are more, to so many weighted draws of the target; the log of its
-    evidence and the least ESS met, as a fraction of the particles and 1 at most. move(key, objects, exponent, which):
-    Metropolis-Hastings of one of three kinds (`move_new`)."""
+    """From draws of the proposal (`draws_a_particle` for each particle) to weighted draws of the target; the log of
+    its evidence; and the smallest ESS on the way, as a fraction of the particles, at most 1. move(key, objects,
+    exponent, which): one of three kinds of Metropolis-Hastings moves (`move_new`)."""
     draws = len(log_weight)
 
     def weighed(level: Array, b: Array, extended: Proposed, log_weight: Array) -> tuple[Array, ...]:
@@ -232,8 +232,8 @@ def _anneal(key, start, log_weight, particles, exponents, move, ess_threshold):
         extended = moved(level_key, level, c, extended, (now < ess_threshold) & jnp.isfinite(gained))
         return level + 1, c, extended, log_weight, log_evidence + gained, jnp.minimum(ess, now)
 
-    # The first step weighs all draws, then thins them: what is likeliest to be missed is a type or a mode of a few
-    # percent, and a draw costs less than a particle that is carried on.
+    # The first step weighs all draws, then thins them. A type or a mode of a few per cent is missed most easily, and a
+    # draw costs less than a particle that is carried on.
     level = jnp.int32(0)
     c, log_weight, gained, now = weighed(level, jnp.float32(0.0), start, log_weight)
     level_key = jax.random.fold_in(key, level)

@@ -85,9 +85,9 @@ def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5
 
 
 def table_frame(plane: Plane, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "4 4"]:
-    """T_camera_table: z along the normal, origin where the optical axis meets the table, x to the camera's right.
+    """T_camera_table: z along the normal, x to the camera's right, origin where the optical axis meets the table.
 
-    Where the axis misses the table, or meets it far behind what is seen, the origin is the middle of what is seen.
+    If the axis misses the table, or meets it far behind what is seen, the origin is the middle of what is seen.
     """
     z = plane.normal
     x = np.array([1.0, 0.0, 0.0]) - z[0] * z
@@ -114,13 +114,13 @@ def workspace(
     table_size: tuple[float, float],
     height: float,
 ) -> Int[np.ndarray, "H W"]:
-    """The kind of every pixel: IN_WORKSPACE if its return belongs to the table or to what stands on it, BEYOND
-    if to something else, NO_RETURN where the point is NaN or, along the table's edge, where one cannot tell.
+    """The class of every pixel: IN_WORKSPACE if its return belongs to the table or to an object on it, BEYOND if it
+    belongs to something else, NO_RETURN if the point is NaN or, along the table's edge, if it cannot be told.
 
-    Returns are candidates between just below the plane and `height` above it, inside the prior area. What rises from
-    the plane is cut into connected pieces; a piece counts as a whole if most of it stands over the convex hull of what
-    is seen of the table's surface. (A chair behind the table touches its edge in the image, and a part of it may lean
-    over.) Raises ParseError where nothing of the table is seen.
+    Candidates are returns between just below the plane and `height` above it, inside the prior area. What rises
+    from the plane is cut into connected pieces. A piece counts as a whole if most of it stands over the convex hull
+    of the visible surface of the table. (A chair behind the table touches the table's edge in the image, and a part
+    of it may lean over.) Raises ParseError if nothing of the table is seen.
     """
     local = (points - T_camera_table[:3, 3]) @ T_camera_table[:3, :3]
     z_camera = points[..., 2]
@@ -166,9 +166,9 @@ def usable_share(
     table_size: tuple[float, float],
     far: float,
 ) -> float:
-    """Of the pixels whose rays (x, y, 1) meet the table's prior area before `far` metres, the share whose return the
-    likelihood makes use of: as the table's, as that of what stands on it, or as evidence that nothing is in between.
-    NaN where no ray meets it."""
+    """Of the pixels whose rays (x, y, 1) meet the table's prior area before `far` metres, the share whose return
+    the likelihood uses: as the table's, as an object's, or as evidence that nothing is in between. NaN if no ray
+    meets it."""
     bare = depth_of_table(rays, T_camera_table, far)
     met = np.isfinite(bare)
     local = (rays[met] * bare[met, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
@@ -179,7 +179,7 @@ def usable_share(
 def connected_pieces(
     risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]
 ) -> tuple[Int[np.ndarray, "H W"], int]:
-    """Pieces of a part of an image that are connected without a jump in depth: labels from 1 on, and how many."""
+    """Pieces of a part of an image that are connected without a jump in depth: labels from 1 on, and their number."""
     # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
     with np.errstate(invalid="ignore"):
         cut = np.zeros(risen.shape, bool)
@@ -196,8 +196,8 @@ def connected_pieces(
 
 
 def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> Delaunay | None:
-    """The convex hull of the largest connected piece of surface, grown by a margin and reaching to below the camera:
-    the lower edge of the image is not the edge of the table."""
+    """The convex hull of the largest connected piece of the table's surface, grown by a margin and extended to
+    below the camera: the lower edge of the image is not the edge of the table."""
     if len(surface) < 50:
         return None
     low = surface.min(0)

@@ -14,7 +14,7 @@ NEAREST = 0.02  # metres: points nearer to the camera, or behind it, are project
 
 
 class ProjectedPoints(NamedTuple):
-    """The pixels that points fall into, the nearest of the image for points outside."""
+    """The pixels that points fall into; for points outside, the nearest pixel of the image."""
 
     z: Float[Array, "*n"]  # metres
     u: Int[Array, "*n"]
@@ -23,7 +23,7 @@ class ProjectedPoints(NamedTuple):
 
 
 def pixels_of(point: Float[Array, "*n 3"], image: ScoredImage) -> ProjectedPoints:
-    """Points are in the camera frame."""
+    """Pixels and depth of points in the camera frame."""
     height, width = image.depth.shape
     z = jnp.maximum(point[..., 2], NEAREST)
     u = jnp.round(point[..., 0] / z * image.focal[0] + image.centre[0]).astype(jnp.int32)
@@ -39,21 +39,22 @@ class SurfaceInCamera(NamedTuple):
     normal: Float[Array, "*n P 3"]
 
     def cosine(self) -> Float[Array, "*n P"]:
-        """Of the angle at which the camera sees them; negative where they face away."""
+        """Cosine of the angle between each normal and the direction to the camera; negative if the surface
+        faces away."""
         return -(self.normal * self.point).sum(-1) / jnp.linalg.norm(self.point, axis=-1)
 
 
 def in_camera(
     point: Float[Array, "*n P 3"], normal: Float[Array, "*n P 3"], T_camera_object: Float[Array, "*n 4 4"]
 ) -> SurfaceInCamera:
-    """Samples that are given in the object frame."""
+    """Samples, given in the object frame, in the camera frame."""
     T = T_camera_object[..., None, :, :]
     turned = [(T[..., :3, :3] * vector[..., None, :]).sum(-1) for vector in (point, normal)]
     return SurfaceInCamera(turned[0] + T[..., :3, 3], turned[1])
 
 
 def normal_motion(surface: SurfaceInCamera, placement: Placement, table: Table) -> Float[Array, "*n P 3"]:
-    """How far the samples move along their normals for a unit of the placement's x, y and yaw."""
+    """How far the samples move along their normals per unit of the placement's x, y and yaw."""
     R, origin = table.T_camera_table[:3, :3], table.T_camera_table[:3, 3]
     p, n = surface
     centre = placement.x[..., None] * R[:, 0] + placement.y[..., None] * R[:, 1] + origin

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table as the camera shows it, and how far from that the table itself may be.
+"""The table's plane as the returns show it, and how far the true table may be from it.
 
-An error of depth that the whole image shares moves the table and all that stands on it alike. So scenes are compared
-about the plane that the returns show, whatever plane was given: no pixel counts twice, and relative poses stay sharp.
-What the table is itself follows from that plane, from what was known of it (a pose, or next to nothing where it was
-found in the depth image) and from how large errors of depth are: Gaussians, to first order.
+A depth error that the whole image shares moves the table and everything on it alike. So scenes are compared about the
+plane that the returns show, whatever plane was given: no pixel counts twice, and relative poses stay sharp. The true
+table follows from three things: that plane, what was known beforehand (a camera pose, or next to nothing if the plane
+was found in the image), and the size of depth errors. All are Gaussian, to first order.
 """
 
 from typing import NamedTuple
@@ -21,13 +21,13 @@ from bayes3d_ros.settings import ParserSettings
 _NEAR = 0.02  # metres from the plane given, within which returns may be the table's
 _FEWEST = 200  # returns
 _FARTHEST_SDS = 4.0  # a plane farther than this from the one given is another surface
-_FOUND_HEIGHT, _FOUND_TILT = 0.05, np.radians(5.0)  # m, rad: of a plane found in the depth image, nothing else is known
-_TILT_ARM = 0.5  # metres across the table over which errors of depth may differ by their standard deviation
+_FOUND_HEIGHT, _FOUND_TILT = 0.05, np.radians(5.0)  # m, rad: prior of a plane that was found in the depth image
+_TILT_ARM = 0.5  # metres across the table over which depth errors may differ by one standard deviation
 
 
 class SeenTable(NamedTuple):
-    """T_camera_table of the plane that the returns show, and of the true table relative to it: mean and standard
-    deviation of tilts about x and y (radians) and height (metres)."""
+    """T_camera_table of the plane that the returns show; and of the true table relative to it, mean and standard
+    deviation of tilts about x and y (radians) and of height (metres)."""
 
     T_camera_table: Float[np.ndarray, "4 4"]
     error: Float[np.ndarray, "3"]
@@ -37,7 +37,8 @@ class SeenTable(NamedTuple):
 def seen_table(
     points: Float[np.ndarray, "N 3"], T_camera_table: Float[np.ndarray, "4 4"], found: bool, settings: ParserSettings
 ) -> SeenTable:
-    """points: returns in the camera; `found`: whether the plane comes from them."""
+    """The plane that the returns show, and the true table relative to it. points: returns in the camera frame;
+    found: whether the given plane was found in them."""
     if found:
         prior = np.array([_FOUND_TILT, _FOUND_TILT, _FOUND_HEIGHT]) ** 2
     else:
@@ -56,7 +57,8 @@ def seen_table(
 
 
 def _offset(points: Float[np.ndarray, "N 3"], T_camera_table: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
-    """Tilts and height of the plane that the returns show, in the frame given; zero where they show none there."""
+    """Tilts and height of the plane that the returns show, relative to the given frame; zero if they show none
+    there."""
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
     near = np.abs((points - origin) @ normal) < _NEAR
     if near.sum() < _FEWEST:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Things of no type in the library, in scenes of known objects.
+"""Unknown things, of no type in the library, in scenes of known objects.
 
 The likelihood scores returns in front of a scene as those of something unknown (`likelihood/shared_errors.py`). Each
-connected region of them is a thing, or outliers:
+connected region of such returns is a thing, or outliers, with
 
     log odds = sum over its returns of (log of the unknown surface's density - log of outliers') - outline's nats
                + log(count_ratio P(unknown)),
 
-the last being the prior of one more thing. Of a thing the box is told: upright, about what is seen, on the table. How
-far it goes on behind is uniform between the depth that is seen and the larger of the sides that are.
+where the last term is the prior of one more thing. A thing is described by a box: upright, about its visible part, on
+the table. How far the box extends behind is uniform between the visible depth and the larger of the visible sides.
 """
 
 from collections.abc import Sequence
@@ -31,17 +31,17 @@ from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
 from bayes3d_ros.parsing.support_plane import connected_pieces
 
-_EIGHT = np.ones((3, 3))  # pixels that touch at a corner are of one thing
-_BRIDGED = 2  # pixels without a return, across which a thing goes on
-_LEAST_SIDE = 0.005  # metres: a box has no side of nothing
+_EIGHT = np.ones((3, 3))  # pixels that touch at a corner belong together
+_BRIDGED = 2  # pixels without a return across which a thing continues
+_LEAST_SIDE = 0.005  # metres: the smallest side of a box
 
 
 class UnknownThing(NamedTuple):
-    """A region of returns and what it tells. Table frame, metres; yaw in [0, pi/2)."""
+    """A region of returns and its box. Table frame, metres; yaw in [0, pi/2)."""
 
     pixels: Int[np.ndarray, "P"]  # places in the image that is scored
-    log_gain: float  # nats over outliers, without the prior of one more thing
-    size: Float[np.ndarray, "3"]  # that is seen: along the box's x and y, and height
+    log_gain: float  # nats over outliers, prior of the outline included, prior of one more thing not
+    size: Float[np.ndarray, "3"]  # of the visible part: along the box's x and y, and height
     centre: Float[np.ndarray, "2"]
     yaw: float
     behind: Float[
@@ -50,7 +50,7 @@ class UnknownThing(NamedTuple):
 
 
 class ThingsOfScenes(NamedTuple):
-    """Of N scenes: the things that each holds, and what they add to the log weight."""
+    """For N scenes: the things in each, and what they add to its log weight."""
 
     held: list[tuple[UnknownThing, ...]]
     log_weight: Float[np.ndarray, "N"]
@@ -64,8 +64,8 @@ def find_things(
     exactly: bool,
     seed: int,
 ) -> ThingsOfScenes:
-    """scenes: depth as the camera shows it; log_prior: of one more thing; room: how many things a scene may hold at
-    most, or exactly: then those with the best odds."""
+    """Sample the unknown things of each scene. scenes: depth as the camera shows it; log_prior: of one more thing;
+    room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds."""
     rng = np.random.default_rng(seed)
     known: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
@@ -77,7 +77,8 @@ def find_things(
         here: list[UnknownThing] = []
         for thing in sorted(known[key], key=lambda thing: -thing.log_gain):
             odds, full = thing.log_gain + log_prior, len(here) >= room
-            # The likelihood counts its gain. In its place stands that of a thing, or of outliers, or of either.
+            # The likelihood has counted the thing's gain. Replace it by the sum over thing and outliers; if `exactly`,
+            # by the thing's odds; if the scene is full, by outliers'.
             either = odds if exactly else float(np.logaddexp(odds, 0.0))
             log_weight[n] += (0.0 if full else either) - thing.log_gain
             if not full and (exactly or rng.uniform() < expit(odds)):
@@ -89,7 +90,7 @@ def find_things(
 
 
 def in_front(depth: Float[np.ndarray, "H W"], seen: Observation) -> Bool[np.ndarray, "h w"]:
-    """Returns that stand in front of a scene by more than a margin, as the likelihood has it."""
+    """Returns that stand in front of a scene by more than a margin, as the likelihood decides it."""
     errors = seen.errors
     assert errors is not None
     height, width = seen.depth.shape
@@ -100,7 +101,7 @@ def in_front(depth: Float[np.ndarray, "H W"], seen: Observation) -> Bool[np.ndar
 
 
 def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownThing, ...]:
-    """Most returns first."""
+    """Regions of returns that may be things, most returns first."""
     errors = seen.errors
     assert errors is not None
     node = len(errors.nodes.sigma) // 2
@@ -140,8 +141,8 @@ def _regions(
     returned: Bool[np.ndarray, "h w"],
     points: Float[np.ndarray, "h w 3"],
 ) -> tuple[Int[np.ndarray, "h w"], int]:
-    """Labels of returns that hang together, from 1 on, and how many: cut where depth jumps, joined across pixels
-    without a return, and joined where they come within `THINGS_APART` of each other."""
+    """Labels of connected returns, from 1 on, and their number. Regions are cut where depth jumps, and joined
+    across pixels without a return and where they come within `THINGS_APART` of each other."""
     if not mask.any():
         return np.zeros(mask.shape, int), 0
     grown = ndimage.binary_dilation(mask, _EIGHT, iterations=_BRIDGED) & (mask | ~returned)
@@ -161,7 +162,7 @@ def _regions(
 
 
 def _box(points: Float[np.ndarray, "P 3"], camera: Float[np.ndarray, "2"]):
-    """The upright box about points over the table: the smallest rectangle around them, and where it may go on."""
+    """The upright box about points over the table: the smallest rectangle around them, and where it may extend."""
     flat = points[:, :2]
     try:
         corners = flat[ConvexHull(flat).vertices]
@@ -187,7 +188,7 @@ def _box(points: Float[np.ndarray, "P 3"], camera: Float[np.ndarray, "2"]):
 
 
 def drawn_box(thing: UnknownThing, share: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "2"], float]:
-    """Size, centre and yaw where the thing goes on for a share, 0 to 1, of how far it may."""
+    """Size, centre and yaw of the box if the thing extends behind by this share, 0 to 1, of how far it may."""
     axis, end, most = int(thing.behind[0]), thing.behind[1], thing.behind[2]
     size = thing.size.copy()
     size[axis] += share * most
@@ -197,7 +198,7 @@ def drawn_box(thing: UnknownThing, share: float) -> tuple[Float[np.ndarray, "3"]
 
 
 def things_image(things: Sequence[UnknownThing], shape: tuple[int, int]) -> Int[np.ndarray, "h w"]:
-    """Which thing each pixel that is scored shows: k + 1, or 0."""
+    """Which thing each scored pixel shows: k + 1, or 0."""
     image = np.zeros(shape[0] * shape[1], np.int32)
     for k, thing in enumerate(things):
         image[thing.pixels] = k + 1

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a motion planner has to be told of scenes: which objects to add, and which to remove.
+"""What to tell a motion planner about scenes: which objects to add, and which to remove.
 
-A planner keeps what it was told. It is told of new objects, of those that moved, of those that are gone, and of
-everything again from time to time, as it may have been started later. It is never told of an object that this memory
-does not hold: others' objects are theirs.
+A planner keeps the objects that were added to it. So it is sent new objects, objects that moved, the removal of objects
+that are gone, and everything again from time to time, in case it was started later. Objects that are not in this memory
+belong to others and are never mentioned.
 """
 
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.posterior.types import ScenePosterior
 
 REPEAT = 5.0  # seconds after which everything is told again
-# An object is told again when it is so far from where it was told: as much as poses differ between two good images.
+# An object is told again if it is so far from where it was last told: as far as poses of two good images differ.
 MOVED = 0.002  # metres; of a box also of its sides
 TURNED = 0.02  # radians; 2 mm at 10 cm
 
 
 class Obstacle(NamedTuple):
-    """An object with its pose in the frame of its scene (metres, quaternion x y z w). type: its model in the library.
-    size: of an unknown thing its box's sides along x, y and z of its frame, whose origin is at the centre of the base;
-    else None."""
+    """An object and its pose in the frame of its scene (metres, quaternion x y z w). type: its model in the
+    library. size: for an unknown thing, the sides of its box along x, y and z of its frame, whose origin is at the
+    centre of the base; else None."""
 
     id: str
     type: str
@@ -35,7 +35,8 @@ class Obstacle(NamedTuple):
 
 
 class ToldObstacles(NamedTuple):
-    """What a planner was told and holds: objects, in one frame, and when all of them were told (seconds)."""
+    """What a planner was told and keeps: objects in one frame, and the time (seconds) at which all of them were
+    last told."""
 
     frame_id: str = ""
     obstacles: tuple[Obstacle, ...] = ()
@@ -43,7 +44,7 @@ class ToldObstacles(NamedTuple):
 
 
 class SceneChanges(NamedTuple):
-    """What to tell a planner: objects to add (or to put in the place of those of their ids), ids to remove."""
+    """What to tell a planner: objects to add (each replaces the object with its id), and ids to remove."""
 
     add: tuple[Obstacle, ...]
     remove: tuple[str, ...]
@@ -52,8 +53,8 @@ class SceneChanges(NamedTuple):
 def changes(
     memory: ToldObstacles, obstacles: Sequence[Obstacle], frame_id: str, now: float
 ) -> tuple[SceneChanges, ToldObstacles]:
-    """What to tell a planner of a scene in frame `frame_id`, and what it holds then. now: seconds, of a clock that
-    never goes back."""
+    """What to tell a planner about a scene in frame `frame_id`, and what the planner keeps afterwards. now: seconds
+    on a clock that never goes back."""
     known = {thing.id: thing for thing in memory.obstacles}
     everything = memory.frame_id != frame_id or now - memory.everything_at >= REPEAT
     add = tuple(thing for thing in obstacles if everything or _differs(known.get(thing.id), thing))
@@ -65,13 +66,13 @@ def changes(
 
 
 def withdrawal(memory: ToldObstacles) -> SceneChanges:
-    """What takes from a planner all that it was told, and nothing else."""
+    """The changes that remove from a planner everything that it was told, and nothing else."""
     return SceneChanges((), tuple(thing.id for thing in memory.obstacles))
 
 
 def check_frame(posterior: ScenePosterior) -> None:
-    """Raises ValueError with one line where the frame of the poses does not stand still: a planner would go on holding
-    objects for where they are no more."""
+    """Raise ValueError, one line, if the frame of the poses moves: a planner would keep objects at places where
+    they no longer are."""
     if posterior.told_in is None:
         name = posterior.frame_id
         raise ValueError(f"planning_scene: output_frame {name!r} is the camera's own, expected a frame that is fixed")
@@ -81,7 +82,7 @@ def check_frame(posterior: ScenePosterior) -> None:
 
 
 def obstacles_of(posterior: ScenePosterior, ids: Sequence[str]) -> tuple[Obstacle, ...]:
-    """The objects of a scene, by their ids."""
+    """The objects of a scene with their ids."""
     return tuple(
         Obstacle(name, found.type, np.asarray(found.position), np.asarray(found.orientation), found.size)
         for name, found in zip(ids, posterior.objects, strict=True)
@@ -89,7 +90,7 @@ def obstacles_of(posterior: ScenePosterior, ids: Sequence[str]) -> tuple[Obstacl
 
 
 def _differs(told: Obstacle | None, now: Obstacle) -> bool:
-    """Whether a planner that was told the one must be told the other."""
+    """Whether a planner that was told the first must be told the second."""
     if told is None or told.type != now.type or (told.size is None) != (now.size is None):
         return True
     if np.linalg.norm(now.position - told.position) > MOVED:

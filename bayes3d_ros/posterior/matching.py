@@ -18,7 +18,8 @@ def match_costs(
     other_type: Int[np.ndarray, "R"],
     radius: Float[np.ndarray, "T"] | None,
 ) -> Float[np.ndarray, "*batch R"]:
-    """Cost of calling two objects the same, less than 0 where they may be (0 is the cost of no match), else inf."""
+    """Cost of taking two objects for the same: negative where they may be (no match costs 0), infinite where they
+    may not."""
     distance = np.linalg.norm(centre[..., None, :] - other_centre, axis=-1)
     same = type_[..., None] == other_type
     other_reach = OTHER_TYPE_REACH if radius is None else radius[type_][..., None] + radius[other_type]
@@ -27,12 +28,13 @@ def match_costs(
 
 
 def match(costs: Float[np.ndarray, "S M R"]) -> Int[np.ndarray, "S M"]:
-    """For every sample the assignment of objects to the R reference objects with the smallest total cost; -1: none."""
+    """For every sample, the assignment of its objects to the R reference objects with the smallest total cost; -1:
+    none."""
     samples, slots, references = costs.shape
     if references == 0 or slots == 0:
         return np.full((samples, slots), -1)
     assigned = np.where(costs.min(-1) < 0, costs.argmin(-1), -1)
-    # Where every object's own best choice is free, that is the optimum; only the rest need a solver.
+    # If every object's own best choice is free, this is the optimum; only other samples need a solver.
     ordered = np.sort(np.where(assigned < 0, -1 - np.arange(slots), assigned), axis=1)
     for s in np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(1)):
         padded = np.concatenate([costs[s].clip(max=1.0), np.zeros((slots, slots))], 1)
@@ -48,10 +50,11 @@ def same_objects(
     reference: int,
     radius: Float[np.ndarray, "T"] | None = None,
 ) -> Int[np.ndarray, "S M"]:
-    """An index for every object such that equal indices mean the same object; -1 in empty slots.
+    """An index for every object; equal indices mean the same object, -1 an empty slot.
 
-    The objects of the reference sample get their slot's index; an object that matches none of them gets an index from
-    M on, the same one for all that match each other (gathered around the heaviest of them first).
+    The objects of the reference sample have the indices of their slots. Objects that match none of them have
+    indices from M on, one for each group of objects that match each other. Groups are formed around the heaviest
+    remaining object, one after the other.
     """
     samples, slots = type_.shape
     costs = match_costs(centre, type_, centre[reference], type_[reference], radius)
@@ -62,7 +65,7 @@ def same_objects(
     left: Bool[np.ndarray, "S M"] = (type_ >= 0) & (index < 0)
     if not left.any():
         return index
-    # Heaviest first; equal weights in an order that does not hang on where samples and slots stand.
+    # Heaviest first; the order of equal weights does not depend on the order of samples and slots.
     where = np.flatnonzero(left)
     place = centre.reshape(-1, 3)[where]
     keys = (place[:, 2], place[:, 1], place[:, 0], type_.ravel()[where], -np.repeat(weights, slots)[where])

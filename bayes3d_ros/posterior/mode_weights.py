@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far off the weights of modes may be, as so few samples tell them."""
+"""Monte Carlo errors of the weights of modes."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,13 +9,15 @@ from jaxtyping import Float, Int
 def mode_weight_errors(
     label: Int[np.ndarray, "N"], weights: Float[np.ndarray, "N"], draw: Int[np.ndarray, "N"]
 ) -> Float[np.ndarray, "K"]:
-    """Standard errors of the weights of modes 0, 1, ...: how much they differ from run to run of the sampler.
+    """Standard errors of the weights of modes 0, 1, ...: how much the weights differ from run to run of the
+    sampler.
 
-    label: the mode of every pose, negative where it is in none; draw: poses of equal numbers descend from one draw.
-    That of a ratio of weighted sums, to first order (the delta method, as for self-normalised importance sampling:
-    Owen, "Monte Carlo theory, methods and examples", 2013, chapter 9), over draws, since copies tell nothing new. To
-    its square comes the variance of Beta(n + 1/2, 1/2), n the effective number of draws: the posterior, under Jeffreys'
-    prior, of a share that n of n draws are in. Else a mode of weight 1 would be certain, however few draws there are.
+    label: the mode of every pose, negative where it is in none; draw: poses with equal numbers descend from one
+    draw. The error is that of a ratio of weighted sums, to first order (the delta method, as for self-normalised
+    importance sampling: Owen, "Monte Carlo theory, methods and examples", 2013, chapter 9), over draws, since
+    copies add no information. Its square is increased by the variance of Beta(n + 1/2, 1/2), with n the effective
+    number of draws: the posterior, under Jeffreys' prior, of a share in which n of n draws lie. Without this term a
+    mode of weight 1 would be certain, however few draws there are.
     """
     listed = label >= 0
     _, owner = np.unique(draw[listed], return_inverse=True)

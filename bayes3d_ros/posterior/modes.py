@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Groups weighted poses into modes whose number is found, not given.
+"""Groups weighted poses into modes. The number of modes is found, not given.
 
 A mode is a peak of the poses' density together with everything that flows up to it (topological mode analysis: Chazal
-et al. 2013, "Persistence-based clustering in Riemannian manifolds"). The density is a Gaussian kernel's, `REACH_ANGLE`
-and `REACH_DISTANCE` wide; two peaks are two modes where the density between them falls below 1 / `VALLEY` of the lower
-one. So narrow peaks are told apart from about four kernel widths on (33 degrees, 4 cm), an arc or a full ring of yaw is
-one wide mode, and a thin bridge of stray samples joins nothing. Few samples of a wide posterior would make a peak each:
-the kernel widens with the spacing of the samples until, for most of the weight, it holds `NEIGHBOURS` effective ones.
+et al. 2013, "Persistence-based clustering in Riemannian manifolds"). The density is estimated with a Gaussian kernel of
+standard deviations `REACH_ANGLE` and `REACH_DISTANCE`. Two peaks are two modes if the density between them falls below
+1 / `VALLEY` of the lower peak. So narrow peaks are separated from about four kernel widths on (33 degrees, 4 cm), an
+arc or a full ring of yaw is one wide mode, and a thin bridge of stray samples joins nothing. Few samples of a wide
+posterior would make a peak each: so the kernel widens with the spacing of the samples until, for most of the weight, it
+holds `NEIGHBOURS` effective ones.
 
-Sums over pairs use einsum: matrices this small are not worth waking BLAS's threads, on a busy machine least of all.
+Sums over pairs use einsum: for matrices this small, waking BLAS's threads costs more than it saves.
 """
 
 from typing import NamedTuple
@@ -21,18 +22,18 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 REACH_ANGLE = np.radians(8.0)  # the kernel's standard deviation in rotation ...
 REACH_DISTANCE = 0.01  # ... and in metres
-VALLEY = 4.0  # the lower peak over the pass to a higher one, from which the two are two modes
-NEIGHBOURS = 8.0  # effective samples within a kernel's width, but no more than ...
+VALLEY = 4.0  # two peaks are two modes if the lower is this many times as dense as the pass between them
+NEIGHBOURS = 8.0  # effective samples that the kernel must hold, but no more than ...
 SHARE = 1 / 6  # ... this share of the weight: six single poses may be six modes
-SPARSE = 0.2  # share of the weight that may have fewer neighbours
+SPARSE = 0.2  # share of the weight for which the kernel may hold fewer
 NEGLIGIBLE_SHARE = 0.02  # weight of a mode that is not worth listing
 DENSE = 0.5  # the medoid of a mode lies where it is at least this much as dense as at its peak
-MOST_NODES = 256  # more poses than this are represented by the so many that cover them best
+MOST_NODES = 256  # if more poses differ, this many stand for all
 
 
 class Nodes(NamedTuple):
-    """Distinct poses that stand for all N: which ones [K], the weight [K] of each, their squared distances [K, K] in
-    kernel widths, the node [N] of every pose."""
+    """Distinct poses that stand for all N: their indices [K], the weight [K] that each stands for, their squared
+    distances [K, K] in kernel widths, and the node [N] of every pose."""
 
     pose: Int[np.ndarray, "K"]
     weight: Float[np.ndarray, "K"]
@@ -55,8 +56,8 @@ def distances2(
 def nodes(
     position: Float[np.ndarray, "N 3"], quaternion: Float[np.ndarray, "N 4"], weights: Float[np.ndarray, "N"]
 ) -> Nodes:
-    """Equal poses are one node. Where more than MOST_NODES differ: poses picked one by one, each the farthest from
-    those before it, until none is farther than a quarter of a kernel width from its nearest."""
+    """Distinct poses: equal ones are one node. If more than MOST_NODES differ, poses are picked one by one, each
+    the farthest from those already picked, until every pose is within a quarter of a kernel width of a picked one."""
     rows = np.concatenate([position, quaternion], 1)
     _, index, owner = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     owner = owner.ravel()
@@ -81,14 +82,15 @@ def _chords2(
     other_position: Float[np.ndarray, "3"],
     other_quaternion: Float[np.ndarray, "4"],
 ) -> Float[np.ndarray, "N"]:
-    """distances2 to one pose with chords for angles: quicker, and the same where it is small."""
+    """As `distances2` to one pose, with chords in place of angles: faster, and equal for small angles."""
     chord2 = 2 - 2 * np.abs(np.einsum("nq,q->n", quaternion, other_quaternion))
     apart2 = np.square(position - other_position).sum(1)
     return chord2.clip(0.0) * (2 / REACH_ANGLE) ** 2 + apart2 / REACH_DISTANCE**2
 
 
 def kernel_width(nodes: Nodes) -> float:
-    """The smallest of 1, 1.25, 1.25^2, ... that has enough weight within it, seen from most of the weight."""
+    """The smallest width of 1, 1.25, 1.25^2, ... kernels at which, for most of the weight, enough weight lies
+    within one width."""
     weight = nodes.weight / nodes.weight.sum()
     enough = min(NEIGHBOURS * np.square(weight).sum(), SHARE) - 1e-9
     width = 1.0
@@ -129,7 +131,7 @@ def _follow(peak: list[int], node: int) -> int:
 
 
 def medoid(nodes: Nodes) -> int:
-    """The pose with the smallest mean squared distance from all, of those where they lie densely."""
+    """Index of the pose with the smallest mean squared distance from all poses, among the poses in dense places."""
     kernel = np.exp(-nodes.distance2 / (2 * kernel_width(nodes) ** 2))
     density, spread = (np.einsum("ij,j->i", pairs, nodes.weight) for pairs in (kernel, nodes.distance2))
     cost = np.where(density >= DENSE * density.max(), spread, np.inf)
@@ -142,12 +144,12 @@ def mode_labels(
     weights: Float[np.ndarray, "N"],
     face: Int[np.ndarray, "N"],
 ) -> Int[np.ndarray, "N"]:
-    """The mode of every pose, 0 for the heaviest; negative where it is left out: -1 where the pose itself counts for
-    next to nothing, -2, -3, ... where its mode does.
+    """The mode of every pose: 0 for the heaviest mode. Poses that are left out have -1 if they weigh next to
+    nothing themselves, and -2, -3, ... if their mode is too light.
 
-    Poses on different contact faces (they differ by 90 degrees or more) are in different modes. Poses that are in no
-    mode of a share of NEGLIGIBLE_SHARE or more are gathered in one more mode where together they make up as much, else
-    they are left out.
+    Poses on different contact faces (they differ by 90 degrees or more) are in different modes. Modes lighter than
+    NEGLIGIBLE_SHARE are merged into one more mode if together they reach that share; otherwise their poses are left
+    out.
     """
     labels = np.full(len(weights), -1)
     counts = len(weights) * weights / weights.sum() >= NEGLIGIBLE_SHARE / 2  # lighter ones are together less than 1 %

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ids that tell which objects of an image are those of images before: what a node remembers, and no parser knows."""
+"""Ids that tell which objects of an image are those of earlier images. A node keeps this memory; a parser has none."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ REMEMBERED_NS = 10 * 10**9  # between the stamps of two images, after which an o
 
 
 class NamedObject(NamedTuple):
-    """An object that was seen: where, in the frame of its memory (metres), and in which image."""
+    """An object that was seen: its place in the frame of the memory (metres), and the stamp of the image."""
 
     id: str
     type: str
@@ -27,7 +27,7 @@ class NamedObject(NamedTuple):
 
 
 class IdMemory(NamedTuple):
-    """Objects that have an id, all seen in one frame, in the order of their ids; how many ids every type has had."""
+    """Objects that have an id, in the order of their ids, all in one frame; and how many ids each type has had."""
 
     frame_id: str = ""
     objects: tuple[NamedObject, ...] = ()
@@ -35,11 +35,12 @@ class IdMemory(NamedTuple):
 
 
 def named(memory: IdMemory, posterior: ScenePosterior) -> tuple[tuple[str, ...], IdMemory]:
-    """Ids `TYPE_K` of the objects of a scene, K = 1, 2, ..., and what is remembered after it.
+    """Ids `TYPE_K` of the objects of a scene, K = 1, 2, ..., and the memory after it.
 
-    An object keeps the id of one of the same type that was within SAME_PLACE of it in the frame that poses are told
-    in: as many pairs as can be, one to one, and of these the smallest sum of distances. All others get new ids, in the
-    order of `objects`. An id that is forgotten is not given again. What was seen in another frame is forgotten.
+    An object keeps the id of a remembered object of the same type within SAME_PLACE of it, in the frame of the
+    poses. Objects are paired one to one: as many pairs as possible, and of these the smallest sum of distances. All
+    other objects get new ids, in the order of `objects`. A forgotten id is not given again. Objects seen in another
+    frame are forgotten.
     """
     known = [
         thing
@@ -69,6 +70,6 @@ def _kept(known: Sequence[NamedObject], objects: Sequence[ObjectEstimate]) -> di
     apart = cdist([found.position for found in objects], [thing.position for thing in known])
     same_type = np.array([[found.type == thing.type for thing in known] for found in objects])
     may_be = same_type & (apart <= SAME_PLACE)
-    # A pair more is worth more than all distances together.
+    # One more pair outweighs all distances together.
     pairs = linear_sum_assignment(np.where(may_be, apart, (1 + min(apart.shape)) * SAME_PLACE))
     return {int(k): known[n].id for k, n in zip(*pairs, strict=True) if may_be[k, n]}

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A frame that poses are told in, beside the camera's, and how far the camera's pose in it may be off."""
+"""A frame other than the camera's in which poses are given, and the covariance that errors of the camera's pose add
+there."""
 
 from typing import NamedTuple
 
@@ -9,11 +10,12 @@ from jaxtyping import Float
 
 
 class OutputFrame(NamedTuple):
-    """name: its frame_id. T_frame_camera: maps the camera's coordinates (optical frame) to it, metres.
+    """name: its frame_id. T_frame_camera: maps coordinates of the camera (optical frame) to it, metres.
 
-    camera_pose_sigma: standard deviations of that pose of the camera, along (metres) and about (radians) each axis.
-    T_frame_table: given where the pose was corrected to the table's plane, as the returns show it: then its errors
-    move things along the plane (x, y) and turn them about its normal (yaw), and do nothing else.
+    camera_pose_sigma: standard deviations of that camera pose along (metres) and about (radians) each axis.
+    T_frame_table: given if the camera pose was corrected to the table's plane, as the returns show it. Then errors
+    of the camera pose move objects along the plane (x, y) and turn them about its normal (yaw), and do nothing
+    else.
     """
 
     name: str
@@ -22,13 +24,13 @@ class OutputFrame(NamedTuple):
     T_frame_table: Float[np.ndarray, "4 4"] | None = None
 
     def camera_error(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
-        """The covariance that errors of the camera's pose give a pose at this position of the frame: of x y z, then of
-        delta in R = Exp(delta) R_mean, on the frame's axes; metres and radians.
+        """The covariance that errors of the camera's pose add to a pose at this position of the frame: of x y
+        z, then of delta in R = Exp(delta) R_mean, on the frame's axes; metres and radians.
 
-        To first order a camera that stands off by rho and is turned by omega about itself moves a thing by
-        rho + omega x arm and turns it by omega, where arm leads from the camera to the thing. On the table's plane,
-        of normal n, what is left is P (rho + omega x arm) and n (n . omega), with P = I - n n' and the arm to the
-        foot of the thing on the plane (docs/outputs.md).
+        To first order, a camera that is displaced by rho and turned about itself by omega moves an object by
+        rho + omega x arm and turns it by omega, with arm the vector from the camera to the object. On the
+        table's plane, with normal n, only P (rho + omega x arm) and n (n . omega) remain, with P = I - n n' and
+        the arm to the foot of the object on the plane (docs/outputs.md).
         """
         arm = position - self.T_frame_camera[:3, 3]
         along, about = np.eye(3), np.eye(3)

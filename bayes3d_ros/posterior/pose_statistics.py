@@ -18,10 +18,10 @@ LOCAL_DISTANCE = 0.05  # ... and this, in metres, of its medoid
 
 class PoseStatistics(NamedTuple):
     """position [3], orientation [4] (quaternion x y z w, w >= 0) and covariance [6, 6] of the heaviest mode;
-    covariance_all: the second moment of all poses about that mode's. Covariances are of x y z, then of delta in
-    R = Exp(delta) R_mean, on the axes of the frame the poses are given in; metres and radians. modes: heaviest first,
-    weights sum to one. modes_dropped: how many are too light to be among them; weight_dropped: the share of the weight
-    that is in none of them."""
+    covariance_all: the second moment of all poses about that mode's. Covariances are of x y z, then of delta in R =
+    Exp(delta) R_mean, on the axes of the frame of the poses; metres and radians. modes: heaviest first, weights sum
+    to one. modes_dropped: the number of modes too light to be listed; weight_dropped: the share of the weight in no
+    listed mode."""
 
     position: Float[np.ndarray, "3"]
     orientation: Float[np.ndarray, "4"]
@@ -73,9 +73,9 @@ def pose_mode(
 ) -> PoseMode:
     """One mode of these poses, of weight sum(weights).
 
-    Its pose is their mean (on SO(3) for the rotation) where all are close together. Along an arc or a ring the mean of
-    all may be far from every one: there it is the mean of those near the medoid. The covariance is the second moment of
-    all about that pose.
+    Its pose is their mean (on SO(3) for the rotation) if all are close together. Along an arc or a ring the mean of
+    all poses may be far from every one of them: there it is the mean of the poses near the medoid. The covariance
+    is the second moment of all poses about that pose.
     """
     local = _near(position, quaternion, int(np.argmax(weights)))
     if not local.all():
@@ -98,10 +98,13 @@ def pose_statistics(
     face: Int[np.ndarray, "N"],
     draw: Int[np.ndarray, "N"] | None = None,
 ) -> PoseStatistics:
-    """Modes of the poses (`modes.py` says what a mode is). Pose and covariance of the whole are the heaviest mode's, a
-    Gaussian: a mean over several would be no pose of the object, and the spread of all poses about it (covariance_all)
-    comes and goes with light modes. Quaternions are x y z w; weights need not sum to one. draw: which independent draw
-    every pose descends from, for the errors of the modes' weights. The order of the poses does not matter."""
+    """Modes of the poses (`modes.py` says what a mode is), and statistics of all of them.
+
+    Pose and covariance of the whole are those of the heaviest mode, a Gaussian: a mean over several modes would be
+    no pose of the object, and the spread of all poses about it (covariance_all) comes and goes with light modes.
+    Quaternions are x y z w; weights need not sum to one. draw: the independent draw that each pose descends from,
+    for the errors of the modes' weights. The order of the poses does not matter.
+    """
     order = np.lexsort([weights, *quaternion.T, *position.T])
     position, quaternion, weights, face = position[order], quaternion[order], weights[order], face[order]
     position, weights = position.astype(float), weights.astype(float) / weights.sum()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A posterior told in another frame than the camera's. Only here is an error of the camera's pose added, once."""
+"""A posterior in another frame than the camera's. Errors of the camera's pose are added here, once, and nowhere
+else."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,19 +19,20 @@ from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior
 def table_frame(
     posterior: ScenePosterior, name: str = "table", camera_pose_sigma: tuple[float, float] = (0.0, 0.0)
 ) -> OutputFrame:
-    """The table's frame (z up, origin on the table) as `T_camera_table` has it. Where the table was found in the image
-    there is no pose of the camera that might be off."""
+    """The table's frame (z up, origin on the table), from `T_camera_table`. If the table was found in the image, no
+    camera pose is involved and no error is added."""
     T_table_camera = inverse_pose(posterior.T_camera_table)
     sigma = (0.0, 0.0) if posterior.table_found else camera_pose_sigma
     return OutputFrame(name, T_table_camera, sigma, np.eye(4))
 
 
 def in_frame(posterior: ScenePosterior, frame: OutputFrame | None) -> ScenePosterior:
-    """A parser's posterior with the poses of its samples and objects in another frame; None: in the camera's, as is.
+    """A parser's posterior with the poses of its samples and objects in another frame; None leaves it in the
+    camera's.
 
-    Samples move rigidly: each is a scene given the camera's pose. Covariances of objects and modes turn with the axes,
-    and hold the errors of the camera's pose besides. Images and `unknown_points` stay in the camera's frame. Raises
-    ValueError for a posterior that is told in another frame already: errors would count twice.
+    Samples move rigidly: each is a scene given the camera's pose. Covariances of objects and modes turn with the
+    axes and then include the errors of the camera's pose. Images and `unknown_points` stay in the camera's frame.
+    Raises ValueError for a posterior that is not in the camera's frame: errors would be added twice.
     """
     if posterior.told_in is not None:
         raise ValueError(f"expected a posterior in the camera's frame, got one in {posterior.told_in.name!r}")
@@ -45,8 +47,8 @@ def in_frame(posterior: ScenePosterior, frame: OutputFrame | None) -> ScenePoste
 
 
 def told_modes(posterior: ScenePosterior, k: int) -> dict[str, tuple[PoseMode, ...]]:
-    """Modes of object k's pose given each type that any sample gives it, in the frame that the posterior is told in;
-    poses are of that type's own frame."""
+    """Modes of object k's pose, for each type that any sample gives it, in the frame of the posterior; poses are
+    those of the type's own frame."""
     modes = modes_by_type(posterior.samples, posterior.object_index, posterior.types, k)
     if posterior.told_in is None:
         return modes
@@ -54,7 +56,7 @@ def told_modes(posterior: ScenePosterior, k: int) -> dict[str, tuple[PoseMode, .
 
 
 def moved_samples(samples: SceneSamples, T: Float[np.ndarray, "4 4"]) -> SceneSamples:
-    """The samples after a rigid motion. Poses of empty slots stay what they are."""
+    """The samples after a rigid motion. Poses of empty slots stay as they are."""
     held = samples.type >= 0
     position, orientation = samples.position.astype(float), samples.orientation.astype(float)
     position[held], orientation[held] = _moved(T, position[held], orientation[held])
@@ -64,7 +66,7 @@ def moved_samples(samples: SceneSamples, T: Float[np.ndarray, "4 4"]) -> SceneSa
 def _moved(
     T: Float[np.ndarray, "4 4"], position: Float[np.ndarray, "... 3"], quaternion: Float[np.ndarray, "... 4"]
 ) -> tuple[Float[np.ndarray, "... 3"], Float[np.ndarray, "... 4"]]:
-    """Poses after a motion, w >= 0; NaN where the motion is not known."""
+    """Poses after a motion, w >= 0; NaN if the motion is not known."""
     if not np.isfinite(T).all():
         return np.full_like(position, np.nan), np.full_like(quaternion, np.nan)
     if not len(position):

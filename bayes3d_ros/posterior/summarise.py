@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""From weighted scenes to what people and robots read: one scene, and how sure every part of it is."""
+"""From weighted scenes to what people and robots read: one scene, and how sure each part of it is."""
 
 from dataclasses import dataclass
 
@@ -27,8 +27,8 @@ POSTERIOR_FIELDS = (
 class Summary:
     """What the samples say. `objects[k]` stands in slot `slots[k]` of sample `reference`, the best scene.
 
-    object_index: which object every slot holds: k < len(objects) for the listed ones, larger for all others, -1 for
-    none. num_objects: p(n); num_unknown: the same of those of no type in the library. p_outlier, sigma (metres):
+    object_index: the object in every slot: k < len(objects) for listed objects, larger for all others, -1 for none.
+    num_objects: p(n); num_unknown: the same for objects of no type in the library. p_outlier, sigma (metres):
     posterior means.
     """
 
@@ -45,14 +45,15 @@ class Summary:
 def summarise(
     samples: SceneSamples, types: tuple[str, ...], min_probability: float, library: Library | None = None
 ) -> Summary:
-    """Summaries of a posterior. `types` are the names that `samples.type` indexes.
+    """Summary of a posterior. `types` are the names that `samples.type` indexes.
 
-    The best scene is the sample that holds the most objects worth listing and the fewest others: the largest sum of
-    p(object exists) - min_probability over its objects; among samples of the same objects, one with their most
-    probable types; among those, the one closest to the objects' mean poses. Objects of the other samples are matched
-    to its objects, same type first, then distance. Its objects are listed, in order of type and then of x, where
-    p(exists) >= min_probability. With the library given, distance is between the centres of the boxes (the origin of
-    a mesh may lie far from its middle) and objects of different types match where their boxes would overlap.
+    The best scene is the sample with the largest sum of p(object exists) - min_probability over its objects: many
+    probable objects and few improbable ones. Among samples of the same objects, one with their most probable types
+    is taken; among those, the one closest to the objects' reported poses. Objects of other samples are matched to
+    its objects, same type first, then distance. Objects of the best scene are listed, in order of type and then of
+    x, if p(exists) >= min_probability. With the library given, distance is between the centres of the boxes (the
+    origin of a mesh may lie far from its middle), and objects of different types match if their boxes would
+    overlap.
     """
     if samples.log_weight.size == 0:
         raise ValueError("a posterior needs at least one sample")
@@ -104,7 +105,7 @@ def number_of_unknown(
 def object_estimates(
     samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], count: int
 ) -> tuple[ObjectEstimate, ...]:
-    """What the samples say of objects 0 .. count - 1, given which object every slot holds."""
+    """What the samples say about objects 0 .. count - 1, given the object in every slot."""
     weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
     weights /= weights.sum()
     return tuple(_estimate(samples, weights, object_index == k, types) for k in range(count))
@@ -113,7 +114,7 @@ def object_estimates(
 def modes_by_type(
     samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], k: int
 ) -> dict[str, tuple[PoseMode, ...]]:
-    """Modes of object k's pose given each type that any sample gives it; poses are of that type's own frame."""
+    """Modes of object k's pose, for each type that any sample gives it; poses are those of the type's own frame."""
     weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
     held = np.where(object_index == k, samples.type, -1)
     return {types[t]: _pose(samples, weights, held == t).modes for t in np.unique(held[held >= 0]).tolist()}
@@ -152,7 +153,7 @@ def posterior_rows(samples: SceneSamples, object_index: Int[np.ndarray, "S M"]) 
 def _centres(
     samples: SceneSamples, library: Library | None
 ) -> tuple[Float[np.ndarray, "S M 3"], Float[np.ndarray, "T"] | None]:
-    """Centres of the boxes, and half of the middle side of every type's box; origins where sizes are unknown."""
+    """Centres of the boxes, and half of the middle side of every type's box; origins and None if sizes are unknown."""
     if library is None or samples.type.size == 0:
         return samples.position.astype(float), None
     # Of an unknown thing the origin is at the centre of the base.
@@ -169,7 +170,7 @@ def _centres(
 
 
 def _most_probable_count(samples: SceneSamples, weights: Float[np.ndarray, "S"]) -> int:
-    """The heaviest sample of the most probable number of objects and types: where matching starts."""
+    """The heaviest sample with the most probable number of objects and types: matching starts from it."""
     kinds = np.sort(samples.type, axis=1)
     candidates = np.ones(len(weights), bool)
     for label in (np.bincount(samples.num_objects, weights)[samples.num_objects], _group_weight(kinds, weights)):
@@ -214,7 +215,7 @@ def _closest(
 
 
 def _first(samples: SceneSamples, candidates: Bool[np.ndarray, "S"], cost: Float[np.ndarray, "S"]) -> int:
-    """The candidate of the smallest cost; equal ones are told apart by their poses, not by their place in the list."""
+    """The candidate with the smallest cost; ties are broken by poses, not by the order of the list."""
     cost = np.where(candidates, cost, np.inf)
     equal = np.flatnonzero(cost <= cost.min() + 1e-12)
     held = samples.type[equal] >= 0

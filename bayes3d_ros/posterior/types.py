@@ -12,14 +12,15 @@ from jaxtyping import Float, Int
 from bayes3d_ros.objects.model import UNKNOWN, ObjectModel
 from bayes3d_ros.posterior.output_frame import OutputFrame
 
-# Of the pixels on the table. Three objects on a bundled table, pixels missing at random: all are found with 0.4 usable,
-# one is taken for another type with 0.36, one is missed with 0.33, and with 0.29 the table passes for empty, p 0.98.
+# Share of the pixels on the table. Measured on three objects on a bundled table, pixels missing at random: with 0.40
+# usable all are found, with 0.36 one is taken for another type, with 0.33 one is missed, and with 0.29 the table passes
+# for empty (p 0.98).
 FEWEST_USABLE = 0.4
 
 
 class SceneSamples(NamedTuple):
-    """Weighted scenes; S samples, up to M objects each. Poses are T_camera_object (camera optical frame, metres), or
-    of the frame that the posterior is told in (ScenePosterior.told_in)."""
+    """Weighted scenes: S samples of up to M objects. Poses are T_camera_object (camera optical frame, metres), or
+    in the frame that ScenePosterior.told_in names."""
 
     log_weight: Float[np.ndarray, "S"]  # normalised: exp sums to one
     num_objects: Int[np.ndarray, "S"]
@@ -35,7 +36,7 @@ class SceneSamples(NamedTuple):
 
 
 class PoseMode(NamedTuple):
-    """One of the places where an object may be: a peak of its pose's density with all that flows up to it."""
+    """One possible pose of an object: a peak of the density of its poses, with all samples that belong to the peak."""
 
     weight: float  # given the object's type; those of all modes sum to one
     position: Float[np.ndarray, "3"]  # T_camera_object
@@ -47,10 +48,11 @@ class PoseMode(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectEstimate:
-    """One object of the best scene, with what the other samples say of it.
+    """One object of the best scene, with what the other samples say about it.
 
-    All but the first three fields is given the most probable type. Pose and covariance are the heaviest mode's: a
-    Gaussian of weight `mode_weight`, and a pose of the object, as a mean over several modes would not be.
+    All fields but the first three are given the most probable type. Pose and covariance are those of the heaviest
+    mode, a Gaussian of weight `mode_weight`: this is a possible pose of the object, which a mean over several modes
+    need not be.
     """
 
     type: str
@@ -81,11 +83,12 @@ class ObjectEstimate:
 
     @property
     def mode_weight(self) -> float:
-        """The weight of the mode that pose and covariance are of, of all listed modes."""
+        """Weight of the heaviest mode, which pose and covariance describe, among the listed modes."""
         return self.modes[0].weight if self.modes else 1.0
 
     def box(self, models: Mapping[str, ObjectModel]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
-        """T_object_box, at the box's centre, and the box's sides in metres: of the model, or of an unknown thing."""
+        """T_object_box, the pose of the box's centre, and the box's sides in metres: those of the type's model,
+        or of the unknown thing."""
         if self.size is None:
             model = models[self.type]
             return model.T_object_box, model.box_size
@@ -110,9 +113,10 @@ class UnexplainedPlace(NamedTuple):
 
 @dataclass(frozen=True)
 class ScenePosterior:
-    """What a parsed frame says. `objects[k]` is labelled k + 1 in `segmentation`.
+    """The posterior of one frame. `objects[k]` has the label k + 1 in `segmentation`.
 
-    Poses of objects and samples are in the camera's optical frame, `frame_id`, or in `told_in` (posterior/reframe.py).
+    Poses of objects and samples are in the camera's optical frame, `frame_id`, or in `told_in`
+    (posterior/reframe.py).
     """
 
     stamp_ns: int
@@ -137,10 +141,12 @@ class ScenePosterior:
     unexplained: tuple[UnexplainedPlace, ...] = ()  # most returns first
     full: bool = False  # whether a scene could hold no more objects than the best one does
     num_unknown: dict[int, float] = field(default_factory=dict)  # p(number of objects of no type in the library)
-    # What returned from unknown things of the best scene: x y z in the camera, metres, and which of `objects`.
+    # Returns from the unknown things of the best scene: x y z in the camera, metres, and which of `objects` they show.
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
-    table_found: bool = False  # in the image alone: its frame is another one in every image, and no camera pose's
+    table_found: bool = (
+        False  # in the image alone: then its frame differs from image to image, and belongs to no camera pose
+    )
     told_in: OutputFrame | None = None  # the frame of the poses; None: the camera's
 
     @property
@@ -154,10 +160,12 @@ class ScenePosterior:
         return np.eye(4) if self.told_in is None else self.told_in.T_frame_camera
 
     def table_position(self, found: ObjectEstimate) -> Float[np.ndarray, "3"]:
-        """Where an object's origin is in the table's frame, metres; NaN where the table's pose is not known.
+        """Origin of an object in the table's frame, metres; NaN where the table's pose is not known.
 
-        Of an unknown thing this is the centre of its box's base. object_learner takes x and y as its at_x and at_y:
-        with a camera pose the frame is the pose's, raised and tilted to the plane that the returns show."""
+        For an unknown thing it is the centre of the base of its box. object_learner takes x and y as its at_x
+        and at_y: with a camera pose, the table's frame is that of the pose, raised and tilted to the plane that
+        the returns show.
+        """
         T = self.T_pose_camera @ self.T_camera_table
         return np.asarray((found.position - T[:3, 3]) @ T[:3, :3], float)
 
@@ -168,12 +176,13 @@ class ScenePosterior:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Those of the notes without which the posterior would be misread, worst first."""
+        """The notes without which the posterior would be misread, worst first."""
         return warning_notes(self.usable_share, self.unexplained, self.full)
 
 
 def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace], full: bool = False) -> tuple[str, ...]:
-    """What nobody should read a posterior without, worst first; full: whether no more objects would have room."""
+    """Notes that nobody should read a posterior without, worst first. full: whether the best scene holds as many
+    objects as a scene may."""
     usable = (usable_note(usable_share),) if usable_share < FEWEST_USABLE else ()
     bound = ("the scene holds max_objects objects, and something is unexplained: there may be more",)
     return (
@@ -184,13 +193,13 @@ def warning_notes(usable_share: float, unexplained: Sequence[UnexplainedPlace], 
 
 
 def usable_note(share: float) -> str:
-    """What to say of too low a share of usable pixels."""
+    """The note for a share of usable pixels that is too low."""
     why = "no return, or beside a depth edge or a missing pixel"
     return f"only {share:.0%} of the pixels on the table can be used ({why}): objects may be missed or mistaken"
 
 
 def unexplained_note(places: Sequence[UnexplainedPlace]) -> str:
-    """What to say of places where returns stand above the table that no surface of the scene explains."""
+    """The note for places where returns stand above the table that no surface of the scene explains."""
     where = ", ".join(f"x {p.x:.2f} y {p.y:.2f} m ({p.pixels} pixels)" for p in places[:3])
     more = f" and {len(places) - 3} more" if len(places) > 3 else ""
     return f"returns above the table that belong to none of the objects, in the table's frame at {where}{more}"

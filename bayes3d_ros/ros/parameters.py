@@ -60,7 +60,12 @@ class DepthInputSettings:
         "z qx qy qz qw; empty: none",
     )
     patience: float = setting(
-        0.5, "longest time that an image waits for its CameraInfo and its camera pose", unit="s", low=0.0, high=10.0
+        0.5,
+        "longest time that an image waits for its CameraInfo and its camera pose. Raise it if tf or the pose topic "
+        "lags behind the images by more",
+        unit="s",
+        low=0.0,
+        high=10.0,
     )
     pose_max_gap: float = setting(
         0.2,

@@ -26,7 +26,7 @@ def effective_fraction(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
 
 
 def distinct_fraction(value: Float[Array, "N"], log_weight: Float[Array, "N"]) -> Float[Array, ""]:
-    """Effective fraction of the particles, those of equal value (copies of one another) counted as one."""
+    """Effective fraction of the particles, where particles of equal value (copies of one another) count as one."""
     order = jnp.argsort(value)
     sorted_value, weight = value[order], jax.nn.softmax(log_weight)[order]
     new = (sorted_value[1:] != sorted_value[:-1]).astype(jnp.int32)
@@ -37,7 +37,8 @@ def distinct_fraction(value: Float[Array, "N"], log_weight: Float[Array, "N"]) -
 def resample(
     key: PRNGKeyArray, tree: Tree, log_weight: Float[Array, "N"], threshold: float
 ) -> tuple[Tree, Float[Array, "N"]]:
-    """The particles, or where their weights are uneven others drawn from them with equal weights."""
+    """The particles and log weights as they are; or, if the effective fraction is below the threshold, particles
+    drawn from them by systematic resampling, with equal weights."""
     few = effective_fraction(log_weight) < threshold
     particles = len(log_weight)
     kept = jnp.where(few, systematic(key, log_weight, particles), jnp.arange(particles))
@@ -45,9 +46,10 @@ def resample(
 
 
 def normalised(log_weight: Float[Array, "N"]) -> tuple[Float[Array, "N"], Float[Array, ""]]:
-    """Log weights that sum to one, and the log of their sum; equal ones where all are zero."""
+    """Log weights that sum to one, and the log of their sum before. If all weights are zero: equal weights, and
+    minus infinity."""
     best = jnp.max(log_weight)
-    log_weight = log_weight - jnp.where(jnp.isfinite(best), best, 0.0)  # thousands of nats cost float32 four digits
+    log_weight = log_weight - jnp.where(jnp.isfinite(best), best, 0.0)  # float32 loses four digits of thousands of nats
     total = jax.nn.logsumexp(log_weight)
     equal = -jnp.log(log_weight.shape[0])
     return jnp.where(jnp.isfinite(total), log_weight - total, equal), best + total

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 
 def stretch(key: PRNGKeyArray, count: int, freedom: float) -> Float[Array, "N 1"]:
-    """What draws of a normal distribution are multiplied by to be draws of a t with so many degrees of freedom."""
+    """Factors that turn draws of a normal distribution into draws of a Student t with `freedom` degrees of freedom."""
     return jnp.sqrt(freedom / jax.random.chisquare(key, freedom, shape=(count, 1)))
 
 

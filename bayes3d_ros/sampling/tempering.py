@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tempered weights: exponents of a path q^(1-b) target^b, and how far log values have to be flattened, each found by
-bisection so that enough draws stay effective."""
+"""Tempering: exponents of a path q^(1-b) target^b, and how far log values must be flattened. Both are found by
+bisection, so that enough draws stay effective."""
 
 from collections.abc import Callable
 
@@ -17,8 +17,8 @@ _LEAST_LOG_BETA = -16.0
 def exponents(
     log_ratio: Float[Array, "D"], log_weight: Float[Array, "D"], levels: int, keep: float
 ) -> Float[Array, "L"]:
-    """`levels` increasing exponents up to 1 (repeated at the end). Each step keeps this share of the effective draws:
-    draws with these weights from q, log_ratio = log target - log q."""
+    """`levels` increasing exponents that end at 1; 1 is repeated if it is reached early. Each step keeps the share
+    `keep` of the effective draws. The draws come from q with these log weights; log_ratio = log target - log q."""
     log_ratio = jnp.maximum(log_ratio - log_ratio.max(), -1e6)
 
     def following(b: Array, _) -> tuple[Array, Array]:
@@ -35,7 +35,8 @@ def longest_step(
     log_weight: Float[Array, "N"],
     keep: float,
 ) -> Float[Array, ""]:
-    """The largest exponent up to `most` that keeps this share of the draws effective that are so now."""
+    """The largest exponent from b to `most` at which the share `keep` of the draws that are effective at b stay
+    effective."""
 
     def enough(c: Array) -> Array:
         step = jnp.where(jnp.isfinite(log_ratio), (c - b) * log_ratio, -jnp.inf)
@@ -49,7 +50,8 @@ def longest_step(
 
 
 def tempered(log_value: Float[Array, "*M D"], effective: float) -> Float[Array, "*M D"]:
-    """Weights exp(beta v), normalised along the last axis, with beta <= 1 as large as keeps `effective` draws."""
+    """Weights proportional to exp(beta v), normalised along the last axis; beta <= 1 is the largest that keeps so
+    many draws effective."""
 
     def weights(log_beta: Float[Array, "*M"]) -> Float[Array, "*M D"]:
         return jax.nn.softmax(jnp.exp(log_beta)[..., None] * log_value, -1)
@@ -71,8 +73,8 @@ def _largest(
     between: Callable[[Array, Array], Array],
     halvings: int,
 ) -> Array:
-    """The largest value within bounds for which a condition holds that holds up to it and not beyond, from below; the
-    lower bound is taken to fulfil it."""
+    """The largest value within bounds for which a condition holds, approached from below. The condition must hold
+    up to that value and not beyond it; it is taken to hold at the lower bound."""
 
     def halve(bounds: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
         low, high = bounds

@@ -4,6 +4,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -98,9 +99,12 @@ def test_a_run_goes_on_and_ends_as_if_it_had_not_been_interrupted(experiment, in
     assert experiment.done == [3, 4]
     assert f"going on after step 2 of 4 ({interrupted})" in result.stderr.splitlines()
     assert result.stdout.splitlines()[:8] == ["the header", *["a row of step 3"] * 3, *["a row of step 4"] * 4]
-    assert run(interrupted.parent / "other").exit_code == 0
-    assert interrupted.read_text() == (interrupted.parent / "other" / "planted.json").read_text()
-    report = json.loads(interrupted.read_text())
+    tmp_other = interrupted.parent / "other"
+    assert run(tmp_other).exit_code == 0
+    report, other = (json.loads((f / "planted.json").read_text()) for f in (interrupted.parent, tmp_other))
+    assert [run["first_step"] for run in report.pop("runs")] == [0, 2]
+    assert [run["first_step"] for run in other.pop("runs")] == [0]
+    assert json.dumps(report) == json.dumps(other)
     assert (report["steps"], report["steps_done"], report["summary"]["rows"]) == (4, 4, 10)
 
 
@@ -110,6 +114,16 @@ def test_a_run_may_be_interrupted_again(experiment, interrupted: Path) -> None:
     experiment.fails_at = None
     result = run(interrupted.parent)
     assert experiment.done == [3, 4] and "going on after step 3 of 4" in result.stderr
+
+
+def test_a_run_on_another_commit_names_both(experiment, interrupted: Path, monkeypatch) -> None:
+    first = json.loads(interrupted.read_text())["runs"]
+    monkeypatch.setattr("bayes3d_ros.cli.evaluate.commit", lambda: "0123456789ab-dirty")
+    assert run(interrupted.parent).exit_code == 0
+    runs = json.loads(interrupted.read_text())["runs"]
+    assert runs[:1] == first and runs[1]["commit"] == "0123456789ab-dirty" and runs[1]["first_step"] == 2
+    for one in runs:
+        assert datetime.fromisoformat(one["started"]).tzinfo is UTC
 
 
 def test_where_no_step_was_done_nothing_is_said(experiment, tmp_path: Path) -> None:
@@ -187,7 +201,7 @@ def test_a_file_that_is_no_report_starts_anew(experiment, interrupted: Path, con
     "damage",
     [
         {"steps_done": None}, {"steps_done": -1}, {"steps_done": STEPS + 1}, {"steps_done": True}, {"steps_done": 0},
-        {"rows": None}, {"rows": {}}, {"rows": [1]},
+        {"rows": None}, {"rows": {}}, {"rows": [1]}, {"runs": None}, {"runs": ["abc"]},
     ],
 )  # fmt: skip
 def test_a_report_that_does_not_hold_together_starts_anew(experiment, interrupted: Path, damage: dict) -> None:

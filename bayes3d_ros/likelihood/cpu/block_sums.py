@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the blocks of a patch say of a scene, at every node: cells of the table and of objects that were there before
-as sums, and the cells of the new object one by one."""
+"""The log likelihoods of the blocks of a patch, at every node: cells of the table and of earlier objects as sums, and
+the cells of the new object one by one."""
 
 import numpy as np
 

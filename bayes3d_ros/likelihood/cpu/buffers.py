@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the loops work in: the arrays that they are given, and those in which one hypothesis follows the other."""
+"""The arrays of the compiled loops: those that they are given, and those in which one hypothesis is worked on after the
+other."""
 
 from typing import NamedTuple
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cells of pixels that share an error, many side by side: how likely their returns are as a function of it, and summed
-over it. What an object's cells say together is in `object_cells.py`.
+"""Cells of pixels that share an error, many side by side: the likelihood of their returns as a function of that error,
+and integrated over it. `object_cells.py` combines the cells of an object.
 
-The densities are those of `likelihood/slow_cells.py`, written again in scalars; tests compare.
+The densities are those of `likelihood/slow_cells.py`, written again in scalars; tests compare them.
 """
 
 from typing import NamedTuple

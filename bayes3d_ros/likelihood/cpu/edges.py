@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the returns of edge pixels say: of pixels whose windows show several surfaces. The density is that of
-`likelihood/slow_shared_errors.py`, written again in scalars; tests compare."""
+"""Densities of the returns of edge pixels, whose windows show several surfaces. They are those of
+`likelihood/slow_shared_errors.py`, written again in scalars; tests compare them."""
 
 import numpy as np
 

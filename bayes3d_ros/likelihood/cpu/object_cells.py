@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The cells of one object: how likely they are together, the error that they share integrated out.
+"""The cells of one object: their joint likelihood, with the error that they share integrated out.
 
-The densities are those of `likelihood/slow_object_cells.py`, written again in scalars; tests compare.
+The densities are those of `likelihood/slow_object_cells.py`, written again in scalars; tests compare them.
 """
 
 from typing import NamedTuple

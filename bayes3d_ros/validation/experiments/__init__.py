@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, Protocol, cast
 Row = dict[str, Any]  # JSON values: no NaN, no numpy; metres, radians, seconds
 Step = Callable[[], list[Row]]  # does the work of one step; its rows reach the disk together
 Of = ParamSpec("Of")
+Wanted = dict[str, str]  # of a summary: name of a number, or GROUP.NAME -> what is wanted of it, in words
 
 # Name on the command line -> module; imported when it is run, because it imports jax.
 EXPERIMENTS: dict[str, str] = {
@@ -33,7 +34,11 @@ EXPERIMENTS: dict[str, str] = {
 
 
 class Experiment(Protocol):
-    """What the module of an experiment offers. `quick` is a run of a minute or so that does every kind of step once."""
+    """What the module of an experiment offers. `quick` is a run of a minute or so that does every kind of step once.
+
+    The module's docstring says what is measured: it opens the experiment's page in docs/validation. A module whose
+    summary has limits also has WANTED (`wanted`).
+    """
 
     HEADER: str  # above the lines of rows
 
@@ -64,6 +69,11 @@ class Experiment(Protocol):
 def row_step(row: Callable[Of, Row], *arguments: Of.args, **options: Of.kwargs) -> Step:
     """A step of one row: that of these arguments."""
     return lambda: [row(*arguments, **options)]
+
+
+def wanted(experiment: Experiment) -> Wanted:
+    """What is wanted of the numbers of an experiment's summary; empty where it has no limits."""
+    return dict(getattr(experiment, "WANTED", {}))
 
 
 def load(name: str) -> Experiment:

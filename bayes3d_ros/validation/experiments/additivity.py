@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether the evidence of a library is the mean of its types': a check of the search that needs no truth.
+"""Is the evidence of a library the mean of the evidences of its types? A check of the search that needs no truth.
 
-The prior of one object is uniform over K types, so its evidence is Z = (1/K) sum_t Z_t, Z_t being that of a library of
-type t alone. A search for one type cannot lose it among others: where Z is smaller, the search for all types did.
+The prior of one object is uniform over K types, so its evidence is Z = (1/K) sum_t Z_t, where Z_t is the evidence with
+a library of type t alone. A search for one type cannot lose that type among others. So where Z is smaller than the
+mean, the search over all types missed something.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,10 +30,11 @@ from bayes3d_ros.validation.experiments.planted import planted_scene, resting_ty
 from bayes3d_ros.validation.experiments.plot_style import label_plot, open_frame
 from bayes3d_ros.validation.simulate.random_scenes import RestingObject
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 SCENES, QUICK_SCENES = 60, 6
 APART_NATS, LEAST_ADDITIVE = 0.3, 0.95  # nats, and the share of the frames that keep to it
+WANTED = {"within": f"at least {LEAST_ADDITIVE:g}"}
 HEADER = f"{'frame':<24} {'log Z':>9} {'mean of types':>13} {'apart':>6}  types of 1 % and more"
 
 

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulation-based calibration of the sampler: scenes from the prior, images from the likelihood's own density, ranks
-of the truth among the samples. Every pixel returned, as the mask is taken as given."""
+"""Do probabilities come true? Simulation-based calibration of the sampler: scenes are drawn from the prior, images from
+the density of the likelihood with independent pixels, and the truth is ranked among the samples.
+
+Every pixel returned, as the model takes the mask of returns as given.
+"""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -28,7 +31,7 @@ from bayes3d_ros.validation.reference.prior_predictive import sample_noise, samp
 from bayes3d_ros.validation.statistics.credible_regions import coverage, quantiles
 from bayes3d_ros.validation.statistics.ranks import brier, effective_size, rank, uniformity
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 CALIBRATION_SCENES, QUICK_CALIBRATION_SCENES = 1000, 32
 SEED = 11  # not one that the sampler was tuned on (4)
@@ -38,6 +41,13 @@ PROBABILITIES = ("n", "type", "face")
 SAME = 0.01  # nats: likelihoods that differ by less are of scenes that look the same, up to rounding
 MISSED = 8.0  # nats by which the truth fits better than every sample
 LEVEL = 0.01  # at which all tests together reject
+WANTED = {
+    "coverage_50": "0.5 within 3 errors",
+    "coverage_90": "0.9 within 3 errors",
+    "tests.smallest_p": "at least rejected_below",
+    "tests.not_covered": "none",
+    "calibrated": "yes",
+}
 HEADER = (
     f"{'scene':>5} {'n':>2} {'p(n)':>5} {'sigma mm':>8} {'p_out':>6} {'size':>5}  "
     + " ".join(f"{name:>6.6}" for name in LATENTS)

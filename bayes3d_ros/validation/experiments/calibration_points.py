@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration experiment with the paper's likelihood: as many free points as pixels, handed over as they are.
+"""Simulation-based calibration with the paper's likelihood: as many free points as pixels are drawn, and scored as they
+are.
 
-sigma_max is so small that windows of 3 x 3 pixels hold the sums: 3 sigma f / z stays within 1.2 pixels.
+`sigma_max` is so small that windows of 3 x 3 pixels hold the sums: 3 sigma f / z stays within 1.2 pixels.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
 
 from bayes3d_ros.validation.experiments import Step, row_step
-from bayes3d_ros.validation.experiments.calibration import HEADER, line, notes, plot, scene_row, summary
+from bayes3d_ros.validation.experiments.calibration import HEADER, WANTED, line, notes, plot, scene_row, summary
 from bayes3d_ros.validation.reference.calibration_problem import SETTINGS, small_problem
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 POINT_SCENES, QUICK_POINT_SCENES = 400, 40
 POINTS = replace(SETTINGS, likelihood="points", sigma_max=0.002)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulation-based calibration of the sampler under errors that pixels share, as shipped: ten YCB types, up to three
-objects, images from the model's own density (`validation/reference/shared_error_predictive.py`).
+"""Simulation-based calibration of the sampler under errors that pixels share, the model as shipped: ten YCB types, up
+to three objects, images from the model's own density (`validation/reference/shared_error_predictive.py`).
 
-Ranks are told thrice: of the posterior as it is; of the one whose density is divided by its integral over images, which
-the images are drawn from (`normalised`); and of sigma and p_outlier given an empty table, on a fine grid in place of
-the nodes that are chosen from the image (`given_scene`).
+Ranks are computed three times: of the posterior as it is; of the posterior under the density divided by its integral
+over images, from which the images are drawn (`normalised`); and of sigma and p_outlier given an empty table, on a fine
+grid in place of the nodes that are chosen from the image (`given_scene`).
 """
 
 import time
@@ -19,7 +19,7 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, row_step
-from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, line, plot, ranked
+from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, WANTED, line, plot, ranked
 from bayes3d_ros.validation.experiments.calibration import summary as summary_of
 from bayes3d_ros.validation.reference.prior_predictive import sample_scene
 from bayes3d_ros.validation.reference.shared_error_frame import RenderedScene, TrueErrors
@@ -37,7 +37,7 @@ from bayes3d_ros.validation.reference.shared_error_problem import (
 )
 from bayes3d_ros.validation.statistics.ranks import uniformity
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 SHARED_SCENES, QUICK_SHARED_SCENES = 500, 60
 SHARED_SEED = 21

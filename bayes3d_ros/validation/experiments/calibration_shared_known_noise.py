@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibration under errors that pixels share where the sampler is told sigma and p_outlier: what is left of its faults
-when none comes from the nodes that are chosen from each image. The same scenes and images as of `calibration-shared`;
-ranks of sigma and p_outlier are drawn at random, as all samples tie."""
+"""Simulation-based calibration under shared errors, with a sampler that is told the true sigma and p_outlier.
+
+Scenes and images are those of `calibration-shared`. Faults that remain are not caused by the nodes of sigma and
+p_outlier that are chosen from each image. Ranks of sigma and p_outlier are random numbers here, as all samples tie.
+"""
 
 from collections.abc import Iterator
 
@@ -10,6 +12,7 @@ from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Step, row_step
 from bayes3d_ros.validation.experiments.calibration_shared import (
     HEADER,
+    WANTED,
     count,
     line,
     notes,
@@ -19,7 +22,7 @@ from bayes3d_ros.validation.experiments.calibration_shared import (
 )
 from bayes3d_ros.validation.reference.shared_error_problem import shared_problem
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 
 def steps(quick: bool) -> Iterator[Step]:

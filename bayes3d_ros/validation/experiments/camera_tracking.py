@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The paper's Table of realtime camera tracking: a camera pans around one object, its first pose is given; how often a
-second, and how far off.
+"""How fast and how exact is camera tracking? The paper's tracking table: a camera pans around one object, and the pose
+of the first frame is given.
 
-Position and orientation are the camera's, in the object's frame. Frames a second count from array in to pose out, with
-everything compiled.
+Errors of position and orientation are those of the camera's pose in the object's frame. Frames a second count the time
+from the array of an image to its pose, with everything compiled.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -163,7 +163,7 @@ def line(row: Row) -> str:
 
 
 def _limits(row: Row) -> tuple[float, float]:
-    """cm and degrees that the issue allows; infinite where it says nothing."""
+    """cm and degrees that are allowed; infinite where there is no limit."""
     if row["frames"] == "own":
         return max(row["paper"]["position_cm"], OWN_POSITION), row["paper"]["orientation_deg"]
     return INDEPENDENT if row["size"] >= 100 else (np.inf, np.inf)
@@ -176,7 +176,7 @@ def _met(row: Row) -> bool:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Worst mean errors of either kind of frames, frames a second by size, the rows that miss the issue's limits."""
+    """Worst mean errors of either kind of frames, frames a second by size, the rows that miss the limits."""
     told: dict[str, Any] = {}
     table = [row for row in rows if row["hypotheses"] == HYPOTHESES]
     for frames in FRAMES_OF:

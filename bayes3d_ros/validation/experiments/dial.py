@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The user's dial: what more particles cost and what they buy, on the bundled frames."""
+"""What do more particles cost, and what do they buy? Measured on the bundled frames."""
 
 import time
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sampler against exhaustive enumeration: evidence, marginals and the number of objects on small problems."""
+"""Is the sampler exact? Evidence, marginals and the number of objects against exhaustive enumeration of small
+problems."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +31,7 @@ from bayes3d_ros.validation.statistics.agreement import (
 )
 from bayes3d_ros.validation.statistics.ranks import effective_size
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 RUN_PARTICLES, ESS_THRESHOLD = 1000, 0.5
 RUNS, QUICK_RUNS = 50, 8
@@ -39,6 +40,14 @@ COMPARED_QUANTITIES = ("type", "face", "yaw")  # whose distributions are compare
 REGION_QUANTITIES, SHARES = ("x", "y", "yaw"), (0.5, 0.9)  # whose regions are
 # What a problem's summary must keep to: at most, and runs within their limit at least.
 MOVES, ERRORS_OFF, RMS_LOG, TV, WIDTH, WITHIN = 0.02, 3.0, 0.3, 0.1, 1.2, 1.0
+WANTED = {
+    "halving_moves": f"at most {MOVES:g}",
+    "errors_off": f"within {ERRORS_OFF:g} of 0",
+    "rms_log": f"at most {RMS_LOG:g}",
+    **{f"tv_{name}": f"at most {TV:g}" for name in (*COMPARED_QUANTITIES, "n")},
+    **{f"within_{name}": f"{WITHIN:g}" for name in COMPARED_QUANTITIES},
+    "width": f"at most {WIDTH:g}",
+}
 HEADER = (
     f"{'problem':<21} {'seed':>5} {'log Z':>9} {'- exact':>8} {'ESS':>6}   "
     "total variation (and 1.5 x what chance allows) of yaw, type, face"
@@ -203,7 +212,7 @@ def line(row: Row) -> str:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """For every problem what the issue asks for: moves of the grid, Z_hat / Z, and total variations."""
+    """For every problem: moves of the grid, Z_hat / Z, total variations, and which limits are missed."""
     told = {}
     for exact in (row for row in rows if row["what"] == "reference"):
         seeds = [row for row in rows if row["what"] == "seed" and row["problem"] == exact["problem"]]
@@ -215,7 +224,7 @@ def problem_summary(exact: Row, seeds: Sequence[Row]) -> Row:
     """`mean` and its error are of Z_hat / Z of the most objects; tv_* are of the runs' mixture, weighted by Z_hat;
     `within_*` is the share of runs no farther off than 1.5 times what chance allows at their ESS. `width` is of the
     mixture's smallest regions, by that of the exact ones, `exact_mass` their probability by the enumeration: regions
-    that are right have ratios about one and hold what they say. `not_met` names what the issue asks for and is not."""
+    that are right have ratios about one and hold what they say. `not_met` names the limits that are missed."""
     told: Row = {"halving_moves": max(abs(m) for m in exact["halving_moves"]), "neglected": exact["neglected"]}
     if len(seeds) < 2:
         return told

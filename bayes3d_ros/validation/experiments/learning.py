@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How good learned models are: their shape, and scenes parsed with learned models alone, for one to eight views."""
+"""How good are learned models? Their shape, and scenes parsed with learned models alone, for one to eight views."""
 
 import tempfile
 import time

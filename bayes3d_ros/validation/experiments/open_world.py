@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is said of things that the library does not hold, and of nothing at all, on simulated tables of YCB objects.
+"""What is reported for objects that the library does not hold, and for empty tables? Simulated tables of YCB objects.
 
-The library holds ten of them. Kinds of frames: one foreign thing (`unknown`; `lookalike` in the summary where a library
+The library holds ten types. Kinds of frames: one foreign object (`unknown`; `lookalike` in the summary where a library
 type fits what is seen of it), one known object (`known`), a dented one (`deformed`), known and foreign ones together
 (`mixed`), and none, or known ones only (`empty`).
 """
@@ -25,7 +25,7 @@ from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import TEN_TYPES, ten_ycb_types, ycb_mesh
 from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.open_world_plot import plot
-from bayes3d_ros.validation.experiments.open_world_summary import summary
+from bayes3d_ros.validation.experiments.open_world_summary import WANTED, summary
 from bayes3d_ros.validation.simulate.deformations import deformed
 from bayes3d_ros.validation.simulate.mixed_tables import random_table
 from bayes3d_ros.validation.simulate.random_scenes import (
@@ -40,7 +40,7 @@ from bayes3d_ros.validation.simulate.scene_file import find_mesh
 from bayes3d_ros.validation.statistics.aligned_types import best_aligned, laid_types
 from bayes3d_ros.validation.statistics.reported_things import TrueThing, answers
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 KINDS = ("unknown", "known", "deformed", "mixed", "empty")
 FRAMES = {"unknown": 5, "known": 10, "deformed": 20}  # of each mesh

@@ -42,6 +42,12 @@ LIMITS = (
 )
 
 
+WANTED = {
+    f"{own.kind}.{own.measure}": f"at least {own.least:g}" if own.least is not None else f"at most {own.most:g}"
+    for own in LIMITS
+}
+
+
 def kind_of(row: Row) -> str:
     """The kind of a row, `lookalike` for foreign things that a library type fits."""
     rms = row["aligned_rms"]

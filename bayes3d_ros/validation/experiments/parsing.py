@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How right parsed frames are: every object of the bundled and the real recordings, how far off and how sure."""
+"""How right are parsed frames? Every object of the bundled and the real recordings: found or not, how far off, how
+sure."""
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether the search reaches the true mode: evidence of one object against importance sampling about the truth.
+"""Does the search reach the true mode? The evidence of one object against importance sampling about the true pose.
 
 An independent renderer makes frames in which 5 to 40 % of an object's columns are in sight, with correlated errors. The
-sampler must report at least the evidence that is about the true pose, and no wrong type for certain.
+sampler must report at least the evidence that lies about the true pose, and must not be certain of a wrong type.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,6 +43,7 @@ FULL_SEED, QUICK_SEED = 1_000, 10_000  # scenes of a quick run are others: the s
 SHARES = 0.05, 0.4  # of the columns in sight
 MISSED_NATS = 0.5  # less evidence than about the truth by more is a missed mode
 LEAST_REACHED, MOST_WRONG = 0.98, 0.01  # shares of the scenes
+WANTED = {"reached": f"at least {LEAST_REACHED:g}", "certain_and_wrong": f"at most {MOST_WRONG:g}"}
 CERTAIN = 0.99
 HEADER = (
     f"{'scene':>6} {'type':<20} {'seen':>5}  {'log Z':>8} {'at truth':>8} {'ESS':>5}  "

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two runs of the sampler on the same frame: effective sizes of every stage, and whether the runs say the same."""
+"""Do two runs of the sampler agree? Effective sample sizes of every stage, and differences between the results of two
+seeds on the same frame."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -26,11 +27,18 @@ from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.parsing import notes, recordings
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 TWO_SEEDS = (0, 1)
 # What two runs of a frame must keep to: effective share of the particles, standard deviations, probability.
 LEAST_ESS, APART, TYPE_APART = 0.1, 1.0, 0.05
+WANTED = {
+    "smallest_ess": f"at least {LEAST_ESS:g}",
+    "stages_below": "0",
+    "other_numbers_listed": "0",
+    "worst_means_apart": f"at most {APART:g}",
+    "worst_type_apart": f"at most {TYPE_APART:g}",
+}
 HEADER = (
     f"{'recording':<18} {'frame':>20}  {'means apart':>11} {'poses apart':>11} {'p(type)':>8} {'p(n)':>6}"
     "  ESS of every stage"
@@ -126,7 +134,7 @@ def line(row: Row) -> str:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Stages and the smallest of their ESS, the worst disagreements, and what misses the issue's limits."""
+    """Stages and the smallest of their ESS, the worst disagreements, and which limits are missed."""
     ess = [share for row in rows for run in row["ess"] for share in run]
     told: dict[str, Any] = {
         "frames": len(rows),

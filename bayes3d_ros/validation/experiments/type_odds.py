@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether odds between two similar types are right, on frames whose shared errors are not those of the likelihood.
+"""Are the odds between two similar types right, on frames whose shared errors are not those of the likelihood?
 
-A cell is a pair of types (an object and the same, a little larger) and an amplitude of the shared errors. Either type
-stands there with probability 1/2; the posterior's log odds are held against that.
+A cell is a pair of types (an object and a slightly larger copy) and an amplitude of the shared errors. Either type
+stands there with probability 1/2, and the posterior's log odds are compared with the truth.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,7 +40,7 @@ from bayes3d_ros.validation.simulate.shared_error_frames import (
 )
 from bayes3d_ros.validation.statistics.log_odds import LEAST_PROBABILITY, calibration_of_odds, certain_and_wrong
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 BOX_SIZE = (0.09, 0.04, 0.17)  # metres: a sugar box's
 BOXES = {"box + 0.75 mm": 0.00075, "box + 1.5 mm": 0.0015, "box + 3 mm": 0.003}  # larger by so much in each dimension
@@ -55,6 +55,12 @@ SETTINGS = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)  # else
 JUDGED_WRONG = (0.05, 0.45)
 RIGHT_SCALE = (0.7, 1.4)  # the interval of the scale that minimises log loss has to meet this one
 MOST_LOG_LOSS = 0.70  # nats; a coin's is 0.693
+WANTED = {
+    "log_loss": f"at most {MOST_LOG_LOSS:g}",
+    "scale_low": f"at most {RIGHT_SCALE[1]:g} where judged",
+    "scale_high": f"at least {RIGHT_SCALE[0]:g} where judged",
+    "certain_wrong": "at most certain_allowed",
+}
 HEADER = (
     f"{'frame':>6} {'pair':<14} {'x':>4} {'truth':<12} {'log odds':>9} {'p(true)':>8}  "
     f"{'form':<7} {'length':>6} {'log Z':>8} {'s':>5}"

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""`bayes3d report`: pages of what `bayes3d evaluate` measured."""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import click
+
+from bayes3d_ros.cli.errors import InputError
+from bayes3d_ros.cli.options import ANY, FOLDER
+from bayes3d_ros.files.atomic import whole_file
+
+
+@click.command()
+@click.argument("reports", metavar="DIR_OR_JSON...", nargs=-1, required=True, type=ANY)
+@click.option("--out", required=True, type=FOLDER, help="Folder for the pages; docs/validation in the repository.")
+def report(reports: tuple[Path, ...], out: Path) -> None:
+    """Write a page in Markdown for each finished experiment.
+
+    Give JSON files of `bayes3d evaluate`, or the folders that hold them. A page, EXPERIMENT.md, says what the
+    experiment measures, the command, commit, date and machine, and the summary with what is wanted. In folders, files
+    of other programs are passed over, and unfinished experiments are named on stderr; a file that you name must be
+    a finished experiment.
+    """
+    from bayes3d_ros.validation.experiments import load, wanted
+    from bayes3d_ros.validation.report import ReportError, page, read_report
+
+    found: dict[str, Path] = {}
+    pages: list[tuple[Path, str]] = []
+    for file, named in _files(reports):
+        try:
+            content = read_report(file)
+        except ReportError as error:
+            if named:
+                raise InputError(str(error)) from None
+            click.echo(f"no page: {error}", err=True)
+            continue
+        name = content["experiment"]
+        if name in found and found[name].resolve() != file.resolve():
+            raise InputError(f"{file}: expected one report of {name}, {found[name]} is another")
+        found[name] = file
+        module = load(name)
+        pages.append((out / f"{name}.md", page(content, module.__doc__ or "", wanted(module))))
+    if not pages:
+        raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
+    out.mkdir(parents=True, exist_ok=True)
+    for path, text in pages:
+        with whole_file(path) as handle:
+            handle.write(text.encode())
+        click.echo(f"{path}")
+
+
+def _files(reports: Iterable[Path]) -> Iterator[tuple[Path, bool]]:
+    """Files to read, and whether the command line names them; in folders those that look like an experiment's."""
+    from bayes3d_ros.validation.report import is_report
+
+    for path in reports:
+        if not path.is_dir():
+            yield path, True
+            continue
+        for file in sorted(path.glob("*.json")):
+            try:
+                content = json.loads(file.read_text())
+            except (OSError, ValueError, RecursionError):
+                continue
+            if is_report(content):
+                yield file, False
