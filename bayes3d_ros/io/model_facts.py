@@ -45,7 +45,7 @@ def source_words(model: ObjectModel) -> str:
         used = sum(not view.get("refused") for view in provenance.get("views", ()))
         return f"learned from {used} view{'s' * (used != 1)}"
     if kind == "mesh":
-        return f"imported from {provenance.get('source', 'a mesh')}"
+        return f"imported from {provenance.get('source') or 'a mesh'}"
     return "not known"
 
 

@@ -73,7 +73,7 @@ def plot_track(
     position, turn, health = (figure.add_subplot(grid[row, 1]) for row in range(3))
     track = _track(estimates, given)
     symbols = _draw_above(above, track, world, models or {})
-    above.legend(handles=symbols, loc="upper left", fontsize=8.5, framealpha=0.9)
+    above.legend(handles=symbols, loc="best", fontsize=8.5, framealpha=0.9)
     _position_panel(position, track)
     _turn_panel(turn, track)
     least = TrackerSettings().least_explained if least_explained is None else least_explained
@@ -191,7 +191,7 @@ def _health_panel(axis: Axes, track: _CameraLine, estimates: Sequence[CameraEsti
         track.seconds, [e.ess for e in estimates], _dots(track), color=INK, label="effective share of the particles"
     )
     axis.set_ylim(-0.03, 1.05)
-    axis.legend(frameon=False, ncols=2, fontsize=8.5, loc="lower left")
+    axis.legend(frameon=False, ncols=2, fontsize=8.5, loc="lower right", bbox_to_anchor=(1.0, 0.98))
     _dress(axis, "health" + (f" (red: lost, {track.lost.sum()} frames)" if track.lost.any() else ""))
 
 

@@ -22,6 +22,6 @@ def track_verdict(estimates: Sequence[CameraEstimate]) -> Verdict:
     explained = min(estimate.explained for estimate in estimates)
     return Verdict(
         True,
-        f"Healthy: never lost in {count}; at least {explained:.0%} of the objects' pixels explained; median standard "
-        f"deviations {np.median(place):.1f} mm, {np.median(turn):.2f} degrees (of all three axes together)",
+        f"Healthy: never lost in {count}; the objects' pixels explained to at least {explained:.0%}; median standard "
+        f"deviations {np.median(place):.1f} mm, {np.median(turn):.2f} degrees",
     )
