@@ -57,7 +57,7 @@ def plot_scene(
     symbols = draw_top_view(figure.add_axes(_ABOVE), posterior, view, intrinsics, models)
     figure.legend(
         handles=symbols, loc="upper left", bbox_to_anchor=_LEGEND, ncols=3, fontsize=8.5, frameon=False,
-        handlelength=1.8, columnspacing=1.6,
+        handlelength=1.8, columnspacing=1.3,
     )  # fmt: skip
     draw_words(figure.add_axes(_WORDS), posterior)
     for axis in figure.axes:

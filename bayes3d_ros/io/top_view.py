@@ -21,6 +21,7 @@ from bayes3d_ros.posterior.types import ScenePosterior, UnexplainedPlace
 
 _SIGMAS = 2.0  # standard deviations that ellipses and arcs show
 _SHORTEST_ARROW = 0.03  # metres
+_ENLARGED, _WIDEST = 10, 0.25  # times that an ellipse is shown larger, if it is not wider then (metres)
 _PALE = 0.45  # opacity of modes but the heaviest
 _SEEN, _AREA = "#f4f1e8", "#8a7a55"  # the visible part of the table, the outline of the area
 
@@ -160,6 +161,13 @@ def _mode(axis: Axes, mode: PlacedMode, thing: StandingObject, alpha: float) -> 
             alpha=0.85 * alpha, zorder=6,
         )
     )  # fmt: skip
+    if alpha == 1 and _ENLARGED * width < _WIDEST:
+        axis.add_patch(
+            Ellipse(
+                tuple(mode.centre), _ENLARGED * width, _ENLARGED * height, angle=angle, fill=False, edgecolor=INK,
+                linewidth=1.0, linestyle=":", zorder=6,
+            )
+        )  # fmt: skip
 
 
 def _object_symbols(objects: tuple[StandingObject, ...]) -> list[Artist]:
@@ -172,7 +180,7 @@ def _object_symbols(objects: tuple[StandingObject, ...]) -> list[Artist]:
         found.append(dashed)
     if objects:
         ellipse = Line2D([], [], marker="o", color="none", markerfacecolor="#888888", markeredgecolor=INK)
-        ellipse.set_label("2 σ of its position, to scale")
+        ellipse.set_label(f"2 σ of its position; dotted: {_ENLARGED} times as large")
         found.append(ellipse)
         found.append(_marker(r"$\rightarrow$", INK, "its x axis (y if x is upright); arc: 2 σ of yaw"))
     if any(len(thing.modes) > 1 for thing in objects):

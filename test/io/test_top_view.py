@@ -70,7 +70,7 @@ def drawn(posterior, models=None):
 
 
 def ellipses(axis):
-    return [patch for patch in axis.patches if type(patch) is Ellipse]
+    return [patch for patch in axis.patches if type(patch) is Ellipse and patch.get_fill()]
 
 
 def test_the_ellipse_has_two_standard_deviations_of_the_posterior(posterior_on_table):
@@ -89,6 +89,8 @@ def test_the_ellipse_has_two_standard_deviations_of_the_posterior(posterior_on_t
     along = np.array([np.cos(np.radians(ellipse.angle)), np.sin(np.radians(ellipse.angle))])
     assert abs(along @ axes[:, 1]) == pytest.approx(1)
     assert ellipse.center == pytest.approx(found.position[:2])
+    (larger,) = [patch for patch in axis.patches if type(patch) is Ellipse and not patch.get_fill()]
+    assert (larger.width, larger.angle) == (pytest.approx(10 * ellipse.width), ellipse.angle)
     (arc,) = [patch for patch in axis.patches if isinstance(patch, Arc)]
     assert arc.theta2 == pytest.approx(np.degrees(2 * np.sqrt(found.covariance[5, 5])))
 
@@ -144,7 +146,7 @@ def test_a_single_mode_has_no_weight(posterior_on_table, models):
         "border of the searched area",
         "camera, and where it looks",
         "object: its box and its outline from above",
-        "2 σ of its position, to scale",
+        "2 σ of its position; dotted: 10 times as large",
         "its x axis (y if x is upright); arc: 2 σ of yaw",
     ]
 
