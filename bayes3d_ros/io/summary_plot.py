@@ -23,6 +23,7 @@ from bayes3d_ros.io.verdict import LEAST_ESS, LEAST_EXPLAINED
 
 _SIGMAS = 2.0  # standard deviations that a band shows, to either side
 _MOST_NAMED = 16  # objects in the legend
+_JUMP, _JUMP_SIGMAS = 0.01, 5.0  # metres, and standard deviations: an object that is farther off has jumped
 _MANY = 40  # frames from which on lines have no dots
 
 
@@ -37,10 +38,36 @@ class _ObjectLine:
     def values(self, of: Callable[[ObjectFacts], float]) -> Float[np.ndarray, "F"]:
         return np.array([of(self._facts[k]) if k in self._facts else np.nan for k in range(self._count)])
 
+    def positions(self, axis: int) -> Float[np.ndarray, "F"]:
+        """Metres, on the table."""
+        return self.values(lambda thing: float(thing.position[axis]))
+
+    def sigmas(self, axis: int) -> Float[np.ndarray, "F"]:
+        """Their standard deviations."""
+        return self.values(lambda thing: float(thing.sigma[axis]))
+
     def middle(self, axis: int) -> float:
         """Metres; what positions are shown relative to."""
-        places = self.values(lambda thing: thing.position[axis])
+        places = self.positions(axis)
         return float(np.nanmedian(places)) if np.isfinite(places).any() else 0.0
+
+
+def jumps(history: SceneHistory) -> list[str]:
+    """Of every object that is for some frames far from its median: how far, and when first; a part of a line. Far: more
+    than 10 mm, and than 5 standard deviations, along the table. None where the table's frame is of each image alone."""
+    if history.table_found:
+        return []
+    found = []
+    for track in _tracks(history):
+        away = np.stack([track.positions(k) - track.middle(k) for k in (0, 1)])
+        sigma = np.stack([track.sigmas(k) for k in (0, 1)])
+        with np.errstate(invalid="ignore"):
+            far = (np.abs(away) > np.maximum(_JUMP_SIGMAS * sigma, _JUMP)).any(0)
+        if far.any():
+            first = int(np.flatnonzero(far)[0])
+            off = 1e3 * float(np.linalg.norm(away[:, first]))
+            found.append(f"{track.name} is {off:.0f} mm from its median in frame {first + 1}")
+    return found
 
 
 def plot_history(history: SceneHistory, path: Path, title: str) -> Path:
@@ -102,8 +129,8 @@ def _style(track: _ObjectLine, frames: int) -> dict[str, Any]:
 def _position_panel(axis: Axes, seconds: Float[np.ndarray, "N"], tracks: Sequence[_ObjectLine], k: int) -> None:
     frames = len(seconds)
     for track in tracks:
-        away = 1e3 * (track.values(lambda thing: thing.position[k]) - track.middle(k))
-        band = 1e3 * _SIGMAS * track.values(lambda thing: thing.sigma[k])
+        away = 1e3 * (track.positions(k) - track.middle(k))
+        band = 1e3 * _SIGMAS * track.sigmas(k)
         axis.fill_between(seconds, away - band, away + band, color=colour(track.number), alpha=0.15, linewidth=0)
         if frames <= _MANY:
             axis.errorbar(
@@ -183,15 +210,18 @@ def _head(figure: Figure, history: SceneHistory, tracks: Sequence[_ObjectLine]) 
     frames = history.frames
     wrong = [k for k, frame in enumerate(frames) if not frame.verdict.healthy]
     count = f"{len(frames)} frame{'s' * (len(frames) != 1)}"
+    moved = jumps(history)
+    told = []
     if wrong:
         first = frames[wrong[0]].verdict.words.removeprefix("Check: ")
-        words = f"Check {len(wrong)} of {count} (shaded). First, frame {wrong[0] + 1}: {first}"
-    else:
-        words = f"Healthy: {count}, no warning"
+        told.append(f"{len(wrong)} of {count} (shaded); first, frame {wrong[0] + 1}: {first}")
+    if moved:
+        told.append(f"{'; '.join(moved[:2])}: moved, or another mode of its pose")
+    words = f"Check {'. Check '.join(told)}" if told else f"Healthy: {count}, no warning"
     if history.table_found:
         words += ". No camera pose: the table's frame is another one in every image, so positions may jump"
     lines = wrap(words, 160)[:3]
-    figure.text(0.06, 0.955, "\n".join(lines), fontsize=10.5, fontweight="bold", color=BAD if wrong else GOOD, va="top")
+    figure.text(0.06, 0.955, "\n".join(lines), fontsize=10.5, fontweight="bold", color=BAD if told else GOOD, va="top")
     handles: list[Artist] = [
         Line2D([], [], **_style(track, 1), label=_told(track, len(frames))) for track in tracks[:_MOST_NAMED]
     ]

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from bayes3d_ros.io import summary_plot
 from bayes3d_ros.io.scene_history import SceneHistory
-from bayes3d_ros.io.summary_plot import plot_history
+from bayes3d_ros.io.summary_plot import jumps, plot_history
 from bayes3d_ros.posterior.reframe import in_frame, table_frame
 
 TYPES = ("bowl", "can", "mug")
@@ -110,7 +110,7 @@ def test_frames_to_check_are_shaded_and_told(tmp_path, history_of, depth_frame, 
     plot_history(history, tmp_path / "a.png", "")
     assert len(spans) == 6 and all(a < 0.3 < b for a, b in spans)  # one a panel
     texts = [text.get_text() for text in made[0].texts]
-    assert any(text.startswith("Check 1 of 3 frames (shaded). First, frame 3: few samples") for text in texts)
+    assert any(text.startswith("Check 1 of 3 frames (shaded); first, frame 3: few samples") for text in texts)
 
 
 def test_the_legend_tells_every_object_its_place_and_how_often_it_was_seen(
@@ -124,3 +124,17 @@ def test_the_legend_tells_every_object_its_place_and_how_often_it_was_seen(
     assert names[0].startswith("bowl_1: x -200 y ") and "frames" not in names[0]
     assert names[1].startswith("can_1: x ") and names[1].endswith(", in 1 of 2 frames")
     assert summary_plot._MOST_NAMED > 2
+
+
+def test_an_object_that_jumps_is_told(tmp_path, history_of, depth_frame, fake_posterior, monkeypatch):
+    history, made = history_of(3), figures(monkeypatch)
+    assert jumps(history) == []
+    posterior = fake_posterior(depth_frame(4 * 10**8), TYPES)
+    first, second = posterior.objects
+    history.add(replace(posterior, objects=(first, replace(second, position=second.position + [0.04, 0.0, 0.0]))))
+    (told,) = jumps(history)
+    assert told == "can_1 is 40 mm from its median in frame 4"
+    plot_history(history, tmp_path / "a.png", "")
+    assert f"Check {told}: moved, or another mode of its pose" in [text.get_text() for text in made[0].texts]
+    history.table_found = True  # then the table's frame jumps
+    assert jumps(history) == []
