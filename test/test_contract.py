@@ -147,7 +147,7 @@ def test_frames_have_the_inputs_size(out: Path, scenes: list[dict]) -> None:
         with Image.open(out / "frames" / f"{scene['stamp_ns']}.png") as picture:
             picture.verify()
     assert len(list((out / "frames").iterdir())) == 2 * len(scenes)
-    assert {path.name for path in out.iterdir()} == {"scenes.jsonl", "samples.npz", "frames"}
+    assert {path.name for path in out.iterdir()} == {"scenes.jsonl", "samples.npz", "summary.png", "frames"}
 
 
 def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, monkeypatch, fake_posterior) -> None:

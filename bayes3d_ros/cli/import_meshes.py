@@ -29,10 +29,12 @@ from bayes3d_ros.cli.progress import progress
 )
 @replace_option
 def import_meshes(meshes: tuple[Path, ...], library: Path, voxel_size: float, scale: float, replace: bool) -> None:
-    """Make object models from mesh files.
+    """Make object models from mesh files, with a picture of each.
 
     A model is named after its file. If one mesh cannot be used, no model is written.
     """
+    from bayes3d_ros.io.model_facts import size_words
+    from bayes3d_ros.io.model_plot import plot_model
     from bayes3d_ros.objects.mesh_import import make_models
     from bayes3d_ros.objects.store import save_model
 
@@ -40,6 +42,7 @@ def import_meshes(meshes: tuple[Path, ...], library: Path, voxel_size: float, sc
     for made in list(progress(models, len(meshes), "mesh")):
         path = save_model(made.model, library, replace=replace or made.replaces)
         again = f", replaces an earlier import of {made.mesh.name}" if made.replaces else ""
-        click.echo(f"{path}  {path.stat().st_size / 1000:.1f} kB{again}")
+        click.echo(f"{path}  {size_words(made.model)}  {path.stat().st_size / 1000:.1f} kB{again}")
+        plot_model(made.model, path.with_suffix(".png"), f"imported from {made.mesh.name}")
         if made.warning:
             click.echo(f"{made.mesh}: {made.warning}", err=True)

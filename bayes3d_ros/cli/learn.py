@@ -71,6 +71,7 @@ def learn(
     model NAME.npz and its picture NAME.png are written to the library.
     """
     from bayes3d_ros.io.bags import read_frames
+    from bayes3d_ros.io.learned_verdict import learned_verdict
     from bayes3d_ros.io.model_plot import plot_model
     from bayes3d_ros.learning.learn import check_name, spread_views
     from bayes3d_ros.learning.learn import learn as learn_model
@@ -98,10 +99,11 @@ def learn(
         )
         click.echo(f"view {number}  {view.stamp_ns}  {'left out: ' * bool(view.refused)}{told}", err=bool(view.refused))
     model, size = learned.model, " x ".join(f"{v:.3f}" for v in learned.model.box_size)
-    used = sum(not view.refused for view in learned.views)
     click.echo(f"{name}: {size} m, {len(model.surface_index)} surface voxels, {learned.coverage:.0%} of them seen")
     for note in learned.notes:
         click.echo(f"{name}: {note}")
-    title = f"{name}: {used} views, {learned.coverage:.0%} of the surface seen (red: not), {size} m"
+    verdict = learned_verdict(learned)
+    click.echo(f"{name}: {verdict.words}")
     click.echo(f"{save_model(model, library, replace=replace)}")
-    click.echo(f"{plot_model(model, library / f'{name}.png', title)}")
+    title = f"learned from {bag.name}; red: seen in no view"
+    click.echo(f"{plot_model(model, library / f'{name}.png', title, verdict)}")

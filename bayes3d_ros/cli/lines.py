@@ -2,12 +2,19 @@
 
 """Lines that commands print of what they work on and what came of it."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # --help must be quick
     from bayes3d_ros.io.bags import FrameReader
     from bayes3d_ros.posterior.types import ScenePosterior
     from bayes3d_ros.tracking.camera_estimate import CameraEstimate
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of words as lines whose columns are aligned, two spaces apart."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(word.ljust(n) for word, n in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def recording_line(frames: "FrameReader") -> str:

@@ -10,9 +10,11 @@ from bayes3d_ros.cli.demo import demo
 from bayes3d_ros.cli.errors import OneLineErrors
 from bayes3d_ros.cli.evaluate import evaluate
 from bayes3d_ros.cli.import_meshes import import_meshes
+from bayes3d_ros.cli.info import info
 from bayes3d_ros.cli.learn import learn
 from bayes3d_ros.cli.parse import parse
 from bayes3d_ros.cli.report import report
+from bayes3d_ros.cli.show import show
 from bayes3d_ros.cli.simulate import simulate
 from bayes3d_ros.cli.track import track
 
@@ -23,7 +25,7 @@ def main() -> None:
     """Posteriors over 3D tabletop scenes from depth images."""
 
 
-for command in (parse, import_meshes, learn, track, simulate, demo, evaluate, report, bench):
+for command in (parse, import_meshes, learn, track, show, info, simulate, demo, evaluate, report, bench):
     main.add_command(command)
 
 if __name__ == "__main__":

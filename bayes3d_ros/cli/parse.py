@@ -3,7 +3,7 @@
 """`bayes3d parse`: every depth frame of a bag into a posterior over scenes."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -26,6 +26,7 @@ from bayes3d_ros.settings import ParserSettings
 if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
     from bayes3d_ros.io.results import ResultsWriter
+    from bayes3d_ros.io.scene_pictures import ScenePictures
     from bayes3d_ros.objects.model import Library
     from bayes3d_ros.ros.recording import SceneRecording
 
@@ -33,7 +34,9 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
 @click.command(cls=CommandWithSettings, kind=ParserSettings)
 @click.argument("bag", type=ANY)
 @click.option("--library", required=True, type=ANY, help="Folder of object models (bayes3d import).")
-@click.option("--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz and frames/.")
+@click.option(
+    "--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz, summary.png and frames/."
+)
 @topic_option
 @click.option(
     "--table",
@@ -76,10 +79,12 @@ def parse(
     """Parse every depth frame of BAG into a posterior over scenes.
 
     BAG is an MCAP file, or a rosbag2 folder of such. Results in OUT: scenes.jsonl (the best scene of each frame, and
-    how sure each part of it is), samples.npz (the posterior) and a picture of each frame.
+    how sure each part of it is), samples.npz (the posterior) a picture of each frame and
+    one of the whole bag.
     """
     from bayes3d_ros.io.bags import read_frames
-    from bayes3d_ros.io.results import ResultsWriter
+    from bayes3d_ros.io.results import SUMMARY_FILE, ResultsWriter
+    from bayes3d_ros.io.scene_pictures import ScenePictures
     from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.objects.store import load_library
 
@@ -91,22 +96,28 @@ def parse(
     results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)
     told = (mcap, table_frame, models, settings.knows_unknown)
     recording = writers.SceneRecording(*told) if writers else NoRecording()
-    done, failed = _parse_frames(frames, models, settings, results, recording)
+    area = settings.table_width, settings.table_depth
+    pictures = ScenePictures(frames, models, out / SUMMARY_FILE, area, sigma)
+    outputs = _Outputs(results, recording, pictures)
+    done, failed = _parse_frames(frames, models, settings, outputs)
     if failed and not done:
         raise click.ClickException(f"{bag}: none of its frames could be parsed ({failed} of {failed} failed)")
     parsed = f"{done} frame{'s' * (done != 1)} parsed" + (f", {failed} could not be" if failed else "")
     click.echo(f"{parsed}; results in {out}" + (f" and {mcap}" if mcap else ""))
 
 
+class _Outputs(NamedTuple):
+    """What takes the frames that are parsed; context managers."""
+
+    results: "ResultsWriter"
+    recording: "SceneRecording | NoRecording"
+    pictures: "ScenePictures"
+
+
 def _parse_frames(
-    frames: "FrameReader",
-    library: "Library",
-    settings: "ParserSettings",
-    writer: "ResultsWriter",
-    recording: "SceneRecording | NoRecording",
+    frames: "FrameReader", library: "Library", settings: "ParserSettings", outputs: _Outputs
 ) -> tuple[int, int]:
     """How many frames were parsed, and how many could not be."""
-    from bayes3d_ros.io.plots import plot_scene
     from bayes3d_ros.jax_runtime import enable_cache
     from bayes3d_ros.parsing.parser import SceneParser
     from bayes3d_ros.posterior.types import ParseError
@@ -115,7 +126,8 @@ def _parse_frames(
     parser = SceneParser(library, settings)
     failed = 0
     notes: tuple[str, ...] = ()
-    with writer as results, recording:
+    results, recording, pictures = outputs
+    with results, recording, pictures:
         for frame in progress(frames, len(frames), "frame"):
             camera = frame.intrinsics
             if not parser.compiled_for(camera.width, camera.height):
@@ -129,9 +141,7 @@ def _parse_frames(
                 say(f"{frames.bag}: {frames.depth_topic}: stamp {frame.stamp_ns}: {error}", err=True)
                 continue
             recording.scene(posterior)
-            picture = results.write(frame.depth, posterior)
-            title = f"{frames.bag.name}   {frames.depth_topic}   stamp {frame.stamp_ns}"
-            plot_scene(frame.depth, posterior, picture, title, camera)
+            pictures.draw(frame, posterior, results.write(frame.depth, posterior))
             for line in (frame_line(posterior), *note_lines(posterior, notes)):
                 say(line)
             notes = posterior.notes

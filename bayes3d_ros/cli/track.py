@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # --help must be quick, --device must come before jax
     from bayes3d_ros.io.bags import FrameReader
     from bayes3d_ros.io.tracking_results import TrackWriter
     from bayes3d_ros.ros.recording import TrackRecording
-    from bayes3d_ros.tracking.camera_estimate import CameraEstimate
+    from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld
     from bayes3d_ros.tracking.session import CameraFollower
     from bayes3d_ros.tracking.tracker import Tracking
 
@@ -69,7 +69,8 @@ def track(
     Results in OUT: cameras.jsonl (the camera's pose in each frame, and how sure it is) and track.png.
     """
     from bayes3d_ros.io.bags import read_frames
-    from bayes3d_ros.io.tracking_results import PICTURE_FILE, TrackWriter, plot_track
+    from bayes3d_ros.io.track_plot import plot_track
+    from bayes3d_ros.io.tracking_results import PICTURE_FILE, TrackWriter
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.objects.store import load_library
     from bayes3d_ros.parsing.parser import SceneParser
@@ -90,21 +91,23 @@ def track(
     click.echo(f"following the camera around {around}")
     recording = writers.TrackRecording(mcap, table_frame) if writers else NoRecording()
     with TrackWriter(out) as results, recording:
-        done, failed = _follow(frames, follower, results, recording)
+        done, failed, world_seen = _follow(frames, follower, results, recording)
     if not done:
         raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
     estimates, recorded = zip(*done, strict=True)
     lost = sum(bool(estimate.lost) for estimate in estimates)
     summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
     summary += f", {failed} could not be" if failed else ""
-    plot_track(estimates, out / PICTURE_FILE, f"{bag.name}   {frames.depth_topic}   {summary}", recorded)
+    title, by_name = f"{bag.name}   {frames.depth_topic}   {summary}", {model.name: model for model in models.models}
+    plot_track(estimates, out / PICTURE_FILE, title, recorded, world_seen, by_name, settings.least_explained)
     click.echo(f"{summary}; results in {out}" + (f" and {mcap}" if mcap else ""))
 
 
 def _follow(
     frames: "FrameReader", follower: "CameraFollower", results: "TrackWriter", recording: "TrackRecording | NoRecording"
-) -> tuple[list[tuple["CameraEstimate", Any]], int]:
-    """The camera of every frame that could be tracked, with its recorded pose, and how many frames could not be."""
+) -> tuple[list[tuple["CameraEstimate", Any]], int, "KnownWorld | None"]:
+    """The camera of every frame that could be tracked, with its recorded pose; how many frames could not be; and what
+    the camera was tracked by."""
     from bayes3d_ros.posterior.types import ParseError
     from bayes3d_ros.tracking.camera_estimate import TrackingError
 
@@ -124,4 +127,4 @@ def _follow(
         recording.camera(estimate)
         done.append((estimate, frame.T_table_camera))
         say(camera_line(estimate))
-    return done, failed
+    return done, failed, None if known is None else known.world

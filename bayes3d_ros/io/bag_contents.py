@@ -19,11 +19,13 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class FirstImage(NamedTuple):
-    """Of a topic's first image: `encoding` of an Image, or `format` of a CompressedImage, and its header's fields."""
+    """Of a topic's first image: `encoding` of an Image, or `format` of a CompressedImage, and its header's fields.
+    size: width and height of an Image."""
 
     encoding: str
     frame_id: str
     stamp: int  # nanoseconds
+    size: tuple[int, int] | None = None
 
 
 @dataclass
@@ -35,6 +37,8 @@ class BagContents:
     count: dict[str, int] = field(default_factory=dict)
     images: dict[str, FirstImage] = field(default_factory=dict)  # by topic
     small: dict[str, list[RawMessage]] = field(default_factory=dict)  # CameraInfo, poses and tf, by topic
+    recorded: dict[str, tuple[int, int]] = field(default_factory=dict)  # first and last time (ns), by topic
+    damage: str = ""  # what could not be read, one line
 
     def __str__(self) -> str:
         """Every topic with its type, and what its images are."""
@@ -63,13 +67,15 @@ def read_contents(bag: Path) -> BagContents:
             if msgtype in (IMAGE, COMPRESSED_IMAGE) and topic not in found.types:
                 image = decode(bag, message)
                 encoding = image.encoding if msgtype == IMAGE else image.format
-                found.images[topic] = FirstImage(encoding, image.header.frame_id, stamp_ns(image.header))
+                size = (image.width, image.height) if msgtype == IMAGE else None
+                found.images[topic] = FirstImage(encoding, image.header.frame_id, stamp_ns(image.header), size)
             elif msgtype in (CAMERA_INFO, POSE, TF):
                 found.small.setdefault(topic, []).append(message)
             found.types[topic] = msgtype
             found.count[topic] = found.count.get(topic, 0) + 1
+            found.recorded[topic] = found.recorded.get(topic, (message.t_ns,))[0], message.t_ns
     except BagDamage as error:
-        damage = error
+        damage, found.damage = error, str(error)
     if not found.count:
         raise damage or BagError(f"{bag}: expected recorded messages, the bag is empty")
     return found

@@ -3,6 +3,7 @@
 """Depth frames from and to recorded bags (rosbag2 folders with MCAP storage, or bare .mcap files), without rclpy."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,29 @@ class FrameReader:
             raise BagDamage("; ".join(filter(None, [f"{self.bag}: {problem}", damage])))
         if damage:
             raise BagDamage(damage)
+
+    def spread(self, most: int) -> list[DepthFrame]:
+        """At most so many frames, spread over the recording; those that cannot be read are left out."""
+        wanted = set(np.linspace(0, len(self) - 1, min(most, len(self))).astype(int).tolist())
+        frames = []
+        with suppress(BagDamage):
+            images = (message for message in raw_messages(self.bag) if message.topic == self.depth_topic)
+            for k, message in enumerate(images):
+                if k in wanted:
+                    with suppress(ValueError, BagError):
+                        frames.append(self._frame(message))
+        return frames
+
+    def camera_poses(self) -> list[Float[np.ndarray, "4 4"] | None]:
+        """T_table_camera of every image, or None, without reading its depths; images that are damaged are left out."""
+        poses = []
+        with suppress(BagDamage):
+            for message in raw_messages(self.bag):
+                if message.topic == self.depth_topic:
+                    with suppress(BagError):
+                        header = decode(self.bag, message).header
+                        poses.append(self._poses.at(stamp_ns(header), header.frame_id))
+        return poses
 
     def _frame(self, message: RawMessage) -> DepthFrame:
         image = decode(self.bag, message)

@@ -20,6 +20,7 @@ from bayes3d_ros.posterior.summarise import POSTERIOR_FIELDS, posterior_rows
 from bayes3d_ros.posterior.types import ObjectEstimate, PoseMode, ScenePosterior, UnexplainedPlace
 
 SCENES_FILE, SAMPLES_FILE, FRAMES_FOLDER = "scenes.jsonl", "samples.npz", "frames"
+SUMMARY_FILE = "summary.png"
 
 
 class ResultsError(Exception):
@@ -125,6 +126,7 @@ class ResultsWriter:
                     if re.fullmatch(r"-?\d+(_\d+)?\.(npz|png)", path.name):
                         path.unlink()
                 (self.folder / SAMPLES_FILE).unlink(missing_ok=True)
+                (self.folder / SUMMARY_FILE).unlink(missing_ok=True)
             self._scenes = (self.folder / SCENES_FILE).open("w")
             self._rows = (self.folder / f".{SAMPLES_FILE}.rows").open("w+b")
         except OSError as error:

@@ -69,6 +69,18 @@ def align_views(surfaces: list[Surface]) -> list[Shift]:
     return [_shift(values, about) for values in found]
 
 
+def residual_between(surfaces: list[Surface]) -> float:
+    """How far aligned views of one object are from each other: the standard deviation, in metres, of signed distances
+    of points of one view from planes of another, worked out from their median so that outliers count little. NaN where
+    no two views show the same part."""
+    clouds = [_cloud(_thinned(surface)) for surface in surfaces]
+    still = _shift(np.zeros(3), np.zeros(2))
+    pairs = [(a, b) for a in range(len(clouds)) for b in range(len(clouds)) if a != b]
+    apart = [_between(clouds[a], clouds[b], still, still, TUNING.reaches[-1])[1] for a, b in pairs]
+    distances = np.abs(np.concatenate(apart)) if apart else np.zeros(0)
+    return 1.4826 * float(np.median(distances)) if len(distances) else float("nan")  # of a Gaussian, its sd
+
+
 def _shift(values: Float[np.ndarray, "3"], about: Float[np.ndarray, "2"]) -> Shift:
     return Shift(float(values[0]), float(values[1]), float(values[2]), about)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.farthest_points import farthest_first
-from bayes3d_ros.learning.align import align_views, moved
+from bayes3d_ros.learning.align import align_views, moved, residual_between
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
 from bayes3d_ros.learning.fusion_constants import CONTRADICTED, SEEN_THROUGH
 from bayes3d_ros.learning.segment import (
@@ -53,12 +53,14 @@ class ViewReport:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """A model and how it came about. `coverage` is the share of its surface that some view saw."""
+    """A model and how it came about. `coverage` is the share of its surface that some view saw; `residual`: see
+    `align.py`, metres."""
 
     model: ObjectModel
     T_table_object: Float[np.ndarray, "4 4"]  # where it stood
     views: tuple[ViewReport, ...]
     coverage: float
+    residual: float = float("nan")
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -116,7 +118,8 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
         for k, frame in enumerate(frames)
     )
     model, T_table_object = _model(name, fused, reports, settings)
-    return Learned(model, T_table_object, reports, float((fused.views > 0).mean()))
+    residual = residual_between(list(aligned.values()))
+    return Learned(model, T_table_object, reports, float((fused.views > 0).mean()), residual)
 
 
 def _segmented(frame: DepthFrame, settings: LearnerSettings) -> View | str:

@@ -22,7 +22,8 @@ from visualization_msgs.msg import MarkerArray
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.io.plots import plot_scene
+from bayes3d_ros.io.scene_plot import plot_scene
+from bayes3d_ros.io.table_view import CommonView
 from bayes3d_ros.objects.mesh_import import import_meshes
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
@@ -100,7 +101,8 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     bag = share_directory() / "bags" / "three_objects"
     library = demo_library(out / "library", say)
-    frame = list(read_frames(bag))[-1]
+    reader = read_frames(bag)
+    frame = list(reader)[-1]
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     domain = free_domain()
     context = rclpy.Context()
@@ -133,7 +135,10 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
         say(line)
     for note in posterior.notes:
         say(f"note: {note}")
-    picture = plot_scene(frame.depth, posterior, out / "scene.png", f"{bag.name}, as published", frame.intrinsics)
+    title, camera = f"{bag.name}   as published   stamp {frame.stamp_ns}", frame.intrinsics
+    models = {model.name: model for model in library.models}
+    view = CommonView(reader.camera_poses()).of(posterior, camera)  # the ranges that `bayes3d parse` shows
+    picture = plot_scene(frame.depth, posterior, out / "scene.png", title, camera, models, view)
     say(f"every output arrived; picture: {picture}")
 
 

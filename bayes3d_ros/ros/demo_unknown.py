@@ -24,7 +24,8 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import raw_messages, read_frames, topics
 from bayes3d_ros.io.captures import CaptureStore
 from bayes3d_ros.io.model_plot import plot_model
-from bayes3d_ros.io.plots import plot_scene
+from bayes3d_ros.io.scene_plot import plot_scene
+from bayes3d_ros.io.table_view import CommonView
 from bayes3d_ros.objects.model import UNKNOWN
 from bayes3d_ros.objects.store import load_library, load_model, model_path
 from bayes3d_ros.posterior.types import ScenePosterior
@@ -77,7 +78,7 @@ class DemoTable:
     """The two nodes as processes, and a camera that shows them one recorded frame after the other."""
 
     def __init__(self, bag: Path, library: Path, out: Path, say: Callable[[str], None]) -> None:
-        self._library, self._say = library, say
+        self.library, self._say = library, say
         self._bag = bag
         self.frames = list(read_frames(bag))
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -143,7 +144,7 @@ class DemoTable:
         stamp_ns = self.frames[k].stamp_ns
         self._wait(lambda: not self._outputs.missing(stamp_ns), f"the scene of frame {k + 1}", PARSE_SECONDS)
         messages = self._outputs.by_stamp[stamp_ns]
-        posterior = posterior_from_messages(messages, load_library(self._library))
+        posterior = posterior_from_messages(messages, load_library(self.library))
         told = [{pair.key: pair.value for pair in status.values} for status in messages["summary"].status[1:]]
         return Told(posterior, tuple(np.array(values["table position m"].split(), float) for values in told))
 
@@ -233,7 +234,7 @@ def run_unknown_demo(out: Path, say: Callable[[str], None]) -> None:
         _tell(before, say)
         place = before.place_of(UNKNOWN)
         _check_known(before, bag, table.frames[0], library)
-        picture = _picture(before, table.frames[0], out / "before.png", "before: the library holds two of the three")
+        picture = _picture(before, table, 0, out / "before.png", "before: the library holds two of the three")
         say(f"   picture: {picture}")
 
         say(f"2. object_learner learns what stands at x {place[0]:.3f} y {place[1]:.3f}, from this view and another:")
@@ -259,7 +260,7 @@ def run_unknown_demo(out: Path, say: Callable[[str], None]) -> None:
         told = ", ".join(found.type for found in after.posterior.objects)
         raise DemoError(f"expected {NEW_NAME} where the unknown thing was; {1e3 * off:.0f} mm off, of {told}")
     _check_known(after, bag, table.frames[2], library)
-    picture = _picture(after, table.frames[2], out / "after.png", f"after: {NEW_NAME} is in the library")
+    picture = _picture(after, table, 2, out / "after.png", f"after: {NEW_NAME} is in the library")
     say(f"   picture: {picture}")
     say(f"What was unknown is known: {NEW_NAME}.")
 
@@ -278,5 +279,9 @@ def _check_known(told: Told, bag: Path, frame: DepthFrame, library: Path) -> Non
             raise DemoError(f"{name} was found {1e3 * off[name]:.0f} mm from where it is (ADD-S)")
 
 
-def _picture(told: Told, frame: DepthFrame, path: Path, title: str) -> Path:
-    return plot_scene(frame.depth, told.posterior, path, title, frame.intrinsics)
+def _picture(told: Told, table: DemoTable, k: int, path: Path, title: str) -> Path:
+    """Of frame k; both pictures have the same ranges."""
+    frame = table.frames[k]
+    models = {model.name: model for model in load_library(table.library).models}
+    view = CommonView([frame.T_table_camera for frame in table.frames]).of(told.posterior, frame.intrinsics)
+    return plot_scene(frame.depth, told.posterior, path, title, frame.intrinsics, models, view)

@@ -91,6 +91,7 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
     lines = [json.loads(text) for text in (out / "scenes.jsonl").read_text().splitlines()]
     assert [line["stamp_ns"] for line in lines] == [1, 2, 3]
     assert set(np.load(out / "samples.npz")["frame"]) == {0, 1, 2}
+    assert (out / "summary.png").stat().st_size > 10_000
     assert sorted(path.name for path in (out / "frames").iterdir()) == [
         f"{s}.{kind}" for s in (1, 2, 3) for kind in ("npz", "png")
     ]
@@ -316,8 +317,8 @@ def test_import_names_models_after_files(tmp_path):
     library = tmp_path / "library"
     result = run("import", tmp_path / "brick.stl", "--library", library, "--voxel-size", "0.01")
     assert result.exit_code == 0, result.output
-    assert str(library / "brick.npz") in result.stdout
-    assert (library / "brick.npz").is_file()
+    assert f"{library / 'brick.npz'}  30 x 40 x 50 mm  " in result.stdout
+    assert (library / "brick.npz").is_file() and (library / "brick.png").stat().st_size > 10_000
     assert run("import", tmp_path / "brick.stl", "--library", library, "--voxel-size", "0").exit_code == 2
 
 
@@ -339,6 +340,63 @@ def test_import_refuses_models_that_exist_and_meshes_in_millimetres(tmp_path):
     assert_one_line(run("import", box, *options, "--scale", "0.002"), 2, library / "brick.npz", "--replace")
     assert (library / "brick.npz").read_bytes() == before
     assert run("import", box, *options, "--scale", "0.002", "--replace").exit_code == 0
+
+
+def test_show_lists_a_library_and_draws_it(library, tmp_path):
+    result = run("show", library)
+    assert result.exit_code == 0, result.output
+    head, block, slab = result.stdout.splitlines()
+    assert head.split("  ")[0] == "name" and head.endswith("stable faces")
+    assert block.split() == [
+        "block",
+        "30",
+        "x",
+        "40",
+        "x",
+        "50",
+        "mm",
+        "10",
+        "mm",
+        "imported",
+        "from",
+        "a",
+        "mesh",
+        "6",
+    ]
+    assert slab.index("30 x") == block.index("30 x") == head.index("box")
+    drawn = run("show", library, "--out", tmp_path / "new" / "sheet.png")
+    assert drawn.stdout.splitlines()[-1] == str(tmp_path / "new" / "sheet.png")
+    assert (tmp_path / "new" / "sheet.png").stat().st_size > 10_000
+    assert_one_line(run("show", tmp_path / "none"), 2, tmp_path / "none", "no such library folder")
+    assert_one_line(run("show", library, "--out", tmp_path / "sheet.jpg"), 2, "sheet.jpg", "ends in .png")
+    (tmp_path / "file").write_text("")
+    assert_one_line(run("show", library, "--out", tmp_path / "file" / "a.png"), 2, tmp_path / "file")
+    (library / "block.npz").write_bytes(b"no model")
+    assert_one_line(run("show", library), 2, library / "block.npz")
+
+
+def test_info_tells_what_a_bag_holds_and_how_to_parse_it(tmp_path):
+    bag = share_directory() / "bags" / "one_object"
+    result = run("info", bag)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    image = next(line for line in lines if line.startswith("/depth/image_rect"))
+    assert image.split()[1:5] == ["sensor_msgs/msg/Image", "4", "10.0", "Hz"] and "640 x 480 16UC1" in image
+    assert lines[-1].split(maxsplit=1) == ["parse", f"bayes3d parse {bag} --library LIBRARY --out OUT"]
+    assert not any(line.startswith("missing") for line in lines)
+    (file,) = bag.glob("*.mcap")
+    assert run("info", file).stdout.splitlines()[:-1] == lines[:-1]
+
+
+def test_info_says_in_one_line_what_is_missing(bag, tmp_path):
+    lines = run("info", bag).stdout.splitlines()
+    (missing,) = [line for line in lines if line.startswith("missing")]
+    assert missing.split(maxsplit=1)[1].startswith("no camera pose; bayes3d parse finds the table in every image")
+    wrong = run("info", bag, "--topic", "/other")
+    assert wrong.exit_code == 0 and "expected a topic /other" in wrong.stdout and "bayes3d parse" not in wrong.stdout
+    assert_one_line(run("info", tmp_path / "none"), 2, tmp_path / "none", "no such file or folder")
+    (tmp_path / "old.db3").write_bytes(b"SQLite format 3\0")
+    assert_one_line(run("info", tmp_path / "old.db3"), 2, "old.db3", "ros2 bag convert")
 
 
 def test_help_does_not_load_what_is_heavy():
@@ -366,6 +424,9 @@ def test_learn_writes_a_model_and_its_picture(tmp_path):
     (model,) = load_library(tmp_path / "library").models
     assert model.name == "mustard" and model.surface_views.max() == 2
     assert (tmp_path / "library" / "mustard.png").stat().st_size > 10_000
+    assert re.search(
+        r"^mustard: Healthy: 2 of 2 views used, camera poses corrected by up to [\d.]+ mm", result.output, re.M
+    )
     assert run("learn", bag, *options, "--replace").exit_code == 0
 
 
@@ -433,7 +494,7 @@ def followers(monkeypatch, parsers):
             T[:3, 3] = 0.1 * frame.stamp_ns, 0.0, 1.0
             lost = "out of sight" if frame.stamp_ns in told.lost else ""
             numbers = {"explained": 0.9, "in_sight": 50, "log_evidence": 5.0, "ess": 0.5, "p_outlier": 0.1}
-            return object(), CameraEstimate(
+            return SimpleNamespace(world=None), CameraEstimate(
                 frame.stamp_ns, frame.frame_id, T, np.eye(6) * 1e-6, T[None], np.zeros(1), sigma=0.001, seconds=0.1,
                 lost=lost, found_again=known is None, **numbers,
             )  # fmt: skip

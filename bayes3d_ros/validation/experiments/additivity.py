@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.io.plots import INK
+from bayes3d_ros.io.palette import INK
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import binom, kstwo
 
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import GREY, open_frame
 from bayes3d_ros.validation.statistics.ranks import reliability

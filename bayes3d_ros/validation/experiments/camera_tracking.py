@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.objects.model import Library, ObjectModel
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.settings import TrackerSettings

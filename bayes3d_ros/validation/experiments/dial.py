@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import open_frame
 from bayes3d_ros.validation.reference.small_problems import TABLE_SIZE

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import load_mesh
 from bayes3d_ros.geometry.poses import look_at
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.learning.learn import Learned, learn
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library, save_model

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayes3d_ros.io.plots import INK
+from bayes3d_ros.io.palette import INK
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.open_world_summary import LIMITS, LOOKALIKE_WITHIN, kind_of, summary
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayes3d_ros.io.plots import INK
+from bayes3d_ros.io.palette import INK
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.observe import observe

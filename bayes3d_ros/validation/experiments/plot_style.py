@@ -6,7 +6,7 @@ from typing import Literal
 
 from matplotlib.axes import Axes
 
-from bayes3d_ros.io.plots import INK
+from bayes3d_ros.io.palette import INK
 
 GREY = "#666666"  # of what is there for comparison
 

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.bags import read_frames
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayes3d_ros.io.plots import INK, colour
+from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
 from bayes3d_ros.validation.statistics.log_odds import calibration_of_odds

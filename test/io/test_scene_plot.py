@@ -10,10 +10,20 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.image import imread
 
-from bayes3d_ros.io.plots import COLOURS, _view_from_above, colour, plot_scene
+from bayes3d_ros.io.palette import COLOURS, colour
+from bayes3d_ros.io.scene_plot import plot_scene
+from bayes3d_ros.io.verdict import scene_verdict
 from bayes3d_ros.posterior.types import UnexplainedPlace, usable_note
 
 TYPES = ("bowl", "can", "mug")
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """All texts that are written into axes: x, y, text."""
+    found = []
+    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: found.append((x, y, text)))
+    return found
 
 
 @pytest.mark.parametrize("objects", [0, 1, 4])
@@ -24,26 +34,40 @@ def test_a_picture_of_a_scene(tmp_path, depth_frame, fake_posterior, objects):
         path = plot_scene(
             frame.depth, fake_posterior(frame, TYPES, objects), tmp_path / "a.png", "title", frame.intrinsics
         )
-    assert imread(path).shape == (820, 1920, 4)
+    assert imread(path).shape == (1080, 1920, 4)
 
 
-def test_a_warning_about_missing_pixels_stands_whole_in_the_picture(tmp_path, depth_frame, fake_posterior, monkeypatch):
+def test_a_warning_about_missing_pixels_stands_whole_in_the_picture(tmp_path, depth_frame, fake_posterior, written):
     frame, note = depth_frame(), usable_note(0.15)
-    written = []
-    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: written.append(text))
     posterior = replace(fake_posterior(frame, TYPES, 0), notes=(note, "made up"), usable_share=0.15)
     plot_scene(frame.depth, posterior, tmp_path / "a.png")
-    (counts,) = [text for text in written if "p(number of objects)" in text]
+    (counts,) = [text for _, _, text in written if "p(number of objects)" in text]
     assert note in counts.replace("\n", " ") and "made up" in counts
+    assert any(text.startswith("Check: only 15% of the table's pixels are usable") for _, _, text in written)
 
 
-def test_what_the_scene_does_not_hold_is_marked(tmp_path, depth_frame, fake_posterior, monkeypatch):
-    frame, written = depth_frame(), []
-    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: written.append((x, y, text)))
+def test_what_the_scene_does_not_hold_is_marked(tmp_path, depth_frame, fake_posterior, written):
+    frame = depth_frame()
     place = UnexplainedPlace(0.12, -0.05, 0.06, 240)
     plot_scene(frame.depth, replace(fake_posterior(frame, TYPES, 0), unexplained=(place,)), tmp_path / "a.png")
     assert (0.12, -0.05, "?") in written
     assert any(text == "nothing of the library, but something" for _, _, text in written)
+
+
+def test_the_table_of_numbers_has_headings_with_units_and_a_row_an_object(
+    tmp_path, depth_frame, fake_posterior, written
+):
+    frame = depth_frame()
+    posterior = fake_posterior(frame, TYPES, 3)
+    plot_scene(frame.depth, posterior, tmp_path / "a.png")
+    texts = [text for _, _, text in written]
+    for heading in ("p(exists)\n", "explained\n% of pixels", "σ position\nmm", "σ yaw\ndegrees", "p(pose)\n"):
+        assert heading in texts
+    found = posterior.objects[1]
+    sigma = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
+    assert {"can", f"{found.probability:.3f}", f"{sigma:.2g}"} <= set(texts)
+    columns = {x for x, _, text in written if text == "1.000"}
+    assert len(columns) == 1  # p(type) of all three, below one another
 
 
 def test_the_residual_is_red_where_the_input_is_nearer(tmp_path, depth_frame, fake_posterior):
@@ -58,10 +82,10 @@ def test_the_residual_is_red_where_the_input_is_nearer(tmp_path, depth_frame, fa
 def test_masks_have_the_colours_of_their_labels(tmp_path, depth_frame, fake_posterior):
     frame = depth_frame()
     pixels = imread(plot_scene(frame.depth, fake_posterior(frame, TYPES, 2), tmp_path / "a.png"))[..., :3]
-    left_below = pixels[450:, :500]  # the segmentation
+    segmentation = pixels[590:1000, 530:1030]
     for label in (1, 2):
         wanted = np.array([int(colour(label)[k : k + 2], 16) / 255 for k in (1, 3, 5)])
-        assert (np.abs(left_below - wanted).max(-1) < 0.01).sum() > 1000
+        assert (np.abs(segmentation - wanted).max(-1) < 0.01).sum() > 1000
 
 
 def test_depth_without_a_single_return_and_empty_masks(tmp_path, depth_frame, fake_posterior):
@@ -77,16 +101,17 @@ def test_colours_are_told_apart():
     assert len(set(COLOURS)) == len(COLOURS) and colour(1) == colour(1 + len(COLOURS))
 
 
-def test_a_table_that_is_not_known_is_read_from_the_reconstruction(tmp_path, depth_frame, fake_posterior):
-    """As in a posterior that was received over ROS: the view must be the same up to a shift along the table."""
-    frame = depth_frame()
-    rays, up = frame.intrinsics.rays(), np.array([0, -0.8, -0.6])
-    plane = (-0.5 / (rays @ up)).astype(np.float32)  # half a metre below the camera
-    posterior = replace(fake_posterior(frame, TYPES), reconstruction=plane, T_camera_table=np.full((4, 4), np.nan))
-    T_table_camera = _view_from_above(posterior, frame.intrinsics)
-    np.testing.assert_allclose(T_table_camera[2, :3], up, atol=1e-5)
-    np.testing.assert_allclose((rays * plane[..., None]) @ up + T_table_camera[2, 3], 0, atol=1e-5)
-    np.testing.assert_allclose(T_table_camera[:3, :3] @ T_table_camera[:3, :3].T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(T_table_camera) > 0
-    for known in (frame.intrinsics, None):
-        plot_scene(frame.depth, posterior, tmp_path / "a.png", intrinsics=known)
+def test_a_verdict_says_what_is_wrong(depth_frame, fake_posterior):
+    posterior = fake_posterior(depth_frame(), TYPES, 2)
+    good = replace(posterior, objects=tuple(replace(o, explained=0.9) for o in posterior.objects))
+    assert scene_verdict(good) == (
+        True,
+        "Healthy: effective sample size at least 50%, each object explained to at least 90%",
+    )
+    worn = replace(good, objects=(good.objects[0], replace(good.objects[1], explained=0.4)))
+    assert not scene_verdict(worn).healthy and "object 2 (40%)" in scene_verdict(worn).words
+    thin = scene_verdict(replace(good, ess=(0.9, 0.02, 0.5)))
+    assert not thin.healthy and "effective sample size 2%" in thin.words
+    place = UnexplainedPlace(0.1, 0.0, 0.05, 99)
+    assert "something stands at 2 places (?)" in scene_verdict(replace(good, unexplained=(place, place))).words
+    assert scene_verdict(replace(posterior, ess=())) == (True, "Healthy: no warning")
