@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bayes3d_ros.cli.lines import frame_line, note_lines, recording_line
-from bayes3d_ros.cli.options import ANY, FOLDER, device_option, settings_from, table_frame_option
+from bayes3d_ros.cli.options import (
+    ANY,
+    FOLDER,
+    check_type_names,
+    device_option,
+    names_in,
+    settings_from,
+    table_frame_option,
+)
 from bayes3d_ros.cli.progress import COMPILING, progress, say, timed
 from bayes3d_ros.cli.recording import NoRecording, mcap_option, recordings
 
@@ -29,6 +37,18 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
 @click.option("--seed", type=int, help="Seed of the random numbers; every frame adds its stamp.")
 @click.option("--particles", type=int, help="Scenes carried by the sampler.")
 @click.option("--max-objects", type=int, help="Most objects a scene may hold.")
+@click.option(
+    "--types",
+    callback=lambda ctx, parameter, value: names_in(value),
+    metavar="NAME,...",
+    help="The only types looked for.",
+)
+@click.option(
+    "--region",
+    type=(float, float, float, float),
+    metavar="X_MIN X_MAX Y_MIN Y_MAX",
+    help="Where objects are looked for: a part of the table, metres in its frame.",
+)
 @click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help="Any other setting of the parser.")
 @click.option(
     "--camera-pose-sigma",
@@ -62,6 +82,7 @@ def parse(
     writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)
     models = load_library(library)
+    check_type_names(settings.types, models)
     frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
     results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)

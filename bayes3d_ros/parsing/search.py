@@ -18,7 +18,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, near_peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, log_prior, moved_into_region, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     UnexplainedReturns,
@@ -147,6 +147,7 @@ def candidates(
     x, y = cells.centre[cell].T
     placement = Placement(type_id, face, x, y, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
     placement, information = align(placement, returns, image, library, table)
+    placement = moved_into_region(placement, table)  # what stands across its border is seen to stand outside
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
     score = surface_score(
@@ -167,7 +168,12 @@ def _gains(
     """Log likelihood gained over one scene at one noise level; -inf outside the prior."""
     ancestor = jnp.zeros(placement.type.shape, jnp.int32)
     gain = log_likelihood_gain(placement, ancestor, depth[None], *context, noise, window)[:, 0, 0]
-    return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), gain, -jnp.inf)
+    return _within_prior(placement, gain, context)
+
+
+def _within_prior(placement: Placement, value: Float[Array, "N"], context: Context) -> Float[Array, "N"]:
+    """Values of objects; -inf outside the prior, where there is nothing to find."""
+    return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), value, -jnp.inf)
 
 
 def find_proposal(
@@ -203,7 +209,8 @@ def find_proposal(
     log_q = log_density(pilots.placement, proposal, library, table)
     log_ratio = pilots.log_target - log_q
     path = exponents(log_ratio, log_q - pilots.log_drawn, SAMPLER.planned_levels, SAMPLER.step_keeps)
-    return proposal, jnp.where(worth, path, jnp.ones(SAMPLER.planned_levels))
+    planned = worth & jnp.isfinite(log_ratio).any()  # no pilot may have met the prior
+    return proposal, jnp.where(planned, path, jnp.ones(SAMPLER.planned_levels))
 
 
 def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int) -> Gains:
@@ -305,13 +312,13 @@ def _targets(
 def _marginal_gains(
     model: ImageModel, loglik_grid: Float[Array, "S P"], scene: LeadScene, context: Context, window: int
 ) -> Gains:
-    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out;
-    loglik_grid: the scene's at these nodes."""
+    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out; -inf
+    outside the prior. loglik_grid: the scene's at these nodes."""
 
     def marginal(placement: Placement) -> Float[Array, "N"]:
         ancestor = jnp.zeros(placement.type.shape, jnp.int32)
         gained, _ = gain(model, placement, ancestor, scene.depth[None], context, window)
-        return log_marginal(model, loglik_grid + gained)
+        return _within_prior(placement, log_marginal(model, loglik_grid + gained), context)
 
     return marginal
 

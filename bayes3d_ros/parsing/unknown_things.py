@@ -10,6 +10,9 @@ connected region of them is a thing, or outliers:
 
 the last being the prior of one more thing. Of a thing the box is told: upright, about what is seen, on the table. How
 far it goes on behind is uniform between the depth that is seen and the larger of the sides that are.
+
+Where the prior has a region, a thing whose middle lies outside is neither told nor counted; its returns stay what they
+are to any scene, such a thing's or outliers.
 """
 
 from collections.abc import Sequence
@@ -27,6 +30,7 @@ from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.likelihood.shared_errors import OUTLINE_NATS
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, stands_in_front
+from bayes3d_ros.objects.placement import in_region
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
 from bayes3d_ros.parsing.support_plane import connected_pieces
@@ -65,7 +69,7 @@ def find_things(
     seed: int,
 ) -> ThingsOfScenes:
     """scenes: depth as the camera shows it; log_prior: of one more thing; room: how many things a scene may hold at
-    most, or exactly: then those with the best odds."""
+    most, or exactly: then those with the best odds. What stands outside the region is none of them."""
     rng = np.random.default_rng(seed)
     known: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
@@ -77,6 +81,9 @@ def find_things(
         here: list[UnknownThing] = []
         for thing in sorted(known[key], key=lambda thing: -thing.log_gain):
             odds, full = thing.log_gain + log_prior, len(here) >= room
+            if not in_region(thing.centre[0], thing.centre[1], seen.table):
+                log_weight[n] += float(np.logaddexp(odds, 0.0)) - thing.log_gain
+                continue
             # The likelihood counts its gain. In its place stands that of a thing, or of outliers, or of either.
             either = odds if exactly else float(np.logaddexp(odds, 0.0))
             log_weight[n] += (0.0 if full else either) - thing.log_gain
