@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.objects.library_arrays import EMPTY, NUM_FACES, LibraryArrays
 
@@ -42,10 +42,10 @@ class Table(NamedTuple):
     region: Float[Array, "2 2"] = cast(Array, _EVERYWHERE)  # least x and y, greatest x and y of box centres
 
 
-def in_region(x: ArrayLike, y: ArrayLike, table: Table) -> Bool[np.ndarray, "..."]:
-    """Whether places on the table, metres in its frame, lie in the region. In numpy: places are not compiled for."""
-    (left, front), (right, back) = np.asarray(table.region)
-    return (left <= np.asarray(x)) & (x <= right) & (front <= np.asarray(y)) & (y <= back)
+def in_region(x: float, y: float, table: Table) -> bool:
+    """Whether a place on the table, metres in its frame, lies in the region."""
+    (left, front), (right, back) = np.asarray(table.region).tolist()
+    return bool(left <= x <= right and front <= y <= back)
 
 
 def moved_into_region(placement: Placement, table: Table) -> Placement:
@@ -53,6 +53,14 @@ def moved_into_region(placement: Placement, table: Table) -> Placement:
     low, high = table.region
     x, y = jnp.clip(placement.x, low[0], high[0]), jnp.clip(placement.y, low[1], high[1])
     return placement._replace(x=x, y=y)
+
+
+def left_out(placement: Placement, library: LibraryArrays, table: Table) -> Bool[Array, "*batch"]:
+    """Whether an object is of a type that is not possible, or stands outside the region."""
+    low, high = table.region
+    at = jnp.stack([placement.x, placement.y], -1)
+    outside = ((at < low) | (at > high)).any(-1)
+    return outside | ((placement.type < library.num_types) & ~library.possible[placement.type])
 
 
 def room(

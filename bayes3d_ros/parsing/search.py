@@ -18,7 +18,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, near_peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, log_prior, moved_into_region, overlap
+from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_into_region, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     UnexplainedReturns,
@@ -168,12 +168,7 @@ def _gains(
     """Log likelihood gained over one scene at one noise level; -inf outside the prior."""
     ancestor = jnp.zeros(placement.type.shape, jnp.int32)
     gain = log_likelihood_gain(placement, ancestor, depth[None], *context, noise, window)[:, 0, 0]
-    return _within_prior(placement, gain, context)
-
-
-def _within_prior(placement: Placement, value: Float[Array, "N"], context: Context) -> Float[Array, "N"]:
-    """Values of objects; -inf outside the prior, where there is nothing to find."""
-    return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), value, -jnp.inf)
+    return jnp.where(jnp.isfinite(log_prior(placement, context.library, context.table)), gain, -jnp.inf)
 
 
 def find_proposal(
@@ -312,13 +307,14 @@ def _targets(
 def _marginal_gains(
     model: ImageModel, loglik_grid: Float[Array, "S P"], scene: LeadScene, context: Context, window: int
 ) -> Gains:
-    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out; -inf
-    outside the prior. loglik_grid: the scene's at these nodes."""
+    """Log likelihoods of the scene with one more object, the nodes of a model, or a part of it, integrated out; -inf of
+    what the prior leaves out, whose modes would take the place of others. loglik_grid: the scene's at these nodes."""
 
     def marginal(placement: Placement) -> Float[Array, "N"]:
         ancestor = jnp.zeros(placement.type.shape, jnp.int32)
         gained, _ = gain(model, placement, ancestor, scene.depth[None], context, window)
-        return _within_prior(placement, log_marginal(model, loglik_grid + gained), context)
+        value = log_marginal(model, loglik_grid + gained)
+        return jnp.where(left_out(placement, context.library, context.table), -jnp.inf, value)
 
     return marginal
 

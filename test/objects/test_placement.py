@@ -161,7 +161,7 @@ def test_room_is_left_where_a_region_holds_only_the_rim(arrays):
 def test_what_lies_in_the_region(arrays):
     table = table_of(0.5, 0.4)._replace(region=np.array([[-0.1, 0.0], [0.1, 0.2]]))
     x, y = np.array([0.0, -0.2, 0.05, 0.0]), np.array([0.1, 0.1, 0.3, -0.1])
-    assert in_region(x, y, table).tolist() == [True, False, False, False]
+    assert [in_region(*place, table) for place in zip(x, y, strict=True)] == [True, False, False, False]
     moved = moved_into_region(placement(BOX, 0, x, y), table)
     np.testing.assert_allclose(moved.x, [0, -0.1, 0.05, 0], rtol=1e-6)
     np.testing.assert_allclose(moved.y, [0.1, 0.1, 0.2, 0], rtol=1e-6)
