@@ -160,6 +160,7 @@ def test_a_library_without_one_of_the_types_is_not_taken(ros, library_folder: Pa
 def test_a_node_that_starts_with_a_wrong_name_says_so(ros, library_folder: Path) -> None:
     robot = Robot(ros, library_folder, mode="on_request", types="[mug]")
     told = f"parameter types names 'mug', which the library does not hold; it holds brick, cube ({library_folder})"
+    ros.wait_for(lambda: robot.diagnostics, "the node's first report", seconds=60)
     ros.wait_for_diagnosis(robot.diagnostics, told)
     answer = ros.call(Trigger, PARSE, Trigger.Request())
     assert not answer.success and told in answer.message
