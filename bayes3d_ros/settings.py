@@ -4,8 +4,8 @@
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, get_args
 
 # Retired names of settings, and the names that took their place. Whoever still gives one is told.
 RETIRED = {
@@ -18,6 +18,11 @@ RETIRED = {
     "table_height_sigma": "camera_position_sigma",
     "table_tilt_sigma": "camera_angle_sigma",
 }
+
+
+LEAST_REGION = 0.02  # metres along each axis: the search of a narrower one would find next to nothing in it
+# Settings of the parser that hold from one frame to the next without anything being compiled.
+PER_FRAME = ("max_objects", "types", "region")
 
 
 def retirement(name: str, known: Collection[str]) -> str:
@@ -37,6 +42,12 @@ def setting(default: Any, description: str, *, unit: str = "", low: Any = None, 
         default=default,
         metadata={"description": description, "unit": unit, "low": low, "high": high, "choices": tuple(choices)},
     )
+
+
+def element_type(field: Field) -> type:
+    """Of a setting that is a list, a tuple of any length: the type of its elements."""
+    element: type = get_args(field.type)[0]
+    return element
 
 
 # Settings that the parser, the learner and the tracker share: fields of dataclasses belong to one class each.
@@ -99,6 +110,21 @@ def _near_before_far(near: float, far: float) -> None:
         raise ValueError(f"near ({near} m) must be smaller than far ({far} m)")
 
 
+def _check_region(region: tuple[float, ...], table: tuple[float, float]) -> None:
+    """A region is empty or a box along the table frame's axes that holds some of the table's area (metres)."""
+    if not region:
+        return
+    told = f"got {list(region)}"
+    if len(region) != 4 or not all(map(math.isfinite, region)):
+        raise ValueError(f"region must be empty or four numbers, x_min, x_max, y_min, y_max in m, {told}")
+    for axis, low, high, size in zip("xy", region[::2], region[1::2], table, strict=True):
+        if low >= high:
+            raise ValueError(f"region must have {axis}_min < {axis}_max, {told}")
+        if min(high, size / 2) - max(low, -size / 2) < LEAST_REGION:
+            area = f"of the table, {axis} from {-size / 2:g} to {size / 2:g} m"
+            raise ValueError(f"region must hold {LEAST_REGION:g} m {area} (table_width, table_depth), {told}")
+
+
 @dataclass(frozen=True)
 class ParserSettings:
     """Settings of the scene parser. The model's own come first, the sampler's after them."""
@@ -113,6 +139,11 @@ class ParserSettings:
         "evidence; objects in plain view do not depend on it",
         low=1e-6,
         high=1.0,
+    )
+    types: tuple[str, ...] = setting(
+        (),
+        "names of the types of the library that objects may be of; empty: all of them. What is of another type counts "
+        "as unknown",
     )
     table: str = setting(
         "auto",
@@ -136,6 +167,12 @@ class ParserSettings:
         unit="m",
         low=0.1,
         high=10.0,
+    )
+    region: tuple[float, ...] = setting(
+        (),
+        "part of that area in which the middles of objects lie: x_min, x_max, y_min, y_max in the table frame; empty: "
+        "the whole area",
+        unit="m",
     )
     workspace_height: float = setting(
         0.5,
@@ -330,6 +367,7 @@ class ParserSettings:
         if self.fixed_objects > self.max_objects:
             raise ValueError(f"fixed_objects ({self.fixed_objects}) exceeds max_objects ({self.max_objects})")
         _near_before_far(self.near, self.far)
+        _check_region(self.region, (self.table_width, self.table_depth))
 
     @property
     def knows_unknown(self) -> bool:

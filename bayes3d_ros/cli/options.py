@@ -6,12 +6,15 @@ import os
 from collections.abc import Callable
 from dataclasses import Field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from bayes3d_ros.cli.errors import InputError
-from bayes3d_ros.settings import retirement
+from bayes3d_ros.settings import element_type, retirement
+
+if TYPE_CHECKING:
+    from bayes3d_ros.objects.model import Library
 
 Settings = TypeVar("Settings")
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -109,20 +112,49 @@ def settings_option(whose: str) -> Callable[[Callable[..., Any]], Callable[..., 
     return click.option("--set", "more", multiple=True, metavar="NAME=VALUE", help=words)
 
 
+def names_in(text: str | None) -> tuple[str, ...] | None:
+    """Names with commas between, of an option that need not be given."""
+    return None if text is None else tuple(filter(None, text.split(",")))
+
+
+def check_type_names(types: tuple[str, ...], library: "Library") -> None:
+    """Refuse types that the library does not hold."""
+    from bayes3d_ros.objects.model import check_types
+
+    try:
+        check_types(types, library)
+    except ValueError as error:
+        raise InputError(f"settings: {error}") from None
+
+
+def _value(field: Field, text: str) -> Any:
+    """A setting's value as it is written on the command line; of a list, with commas between."""
+    kind: type = type(field.default)
+    if kind is tuple:
+        return tuple(map(element_type(field), filter(None, text.split(","))))
+    return _BOOLEANS[text.lower()] if kind is bool else kind(text)
+
+
+def _value_name(field: Field) -> str:
+    """What a setting's value is, for a message."""
+    kind = type(field.default)
+    return f"{element_type(field).__name__},..." if kind is tuple else kind.__name__
+
+
 def settings_from(kind: type[Settings], more: tuple[str, ...], options: dict[str, Any]) -> Settings:
     """Settings from the command's own options and from --set NAME=VALUE."""
-    kinds: dict[str, type] = {f.name: type(f.default) for f in fields(kind)}  # type: ignore[arg-type]
+    known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
     chosen = {name: value for name, value in options.items() if value is not None}
     for text in more:
         name, _, value = text.partition("=")
-        if retired := retirement(name, kinds):
+        if retired := retirement(name, known):
             raise InputError(f"--set {text}: {retired}")
-        if name not in kinds:
-            raise InputError(f"--set {text}: expected one of {', '.join(kinds)}")
+        if name not in known:
+            raise InputError(f"--set {text}: expected one of {', '.join(known)}")
         try:
-            chosen[name] = _BOOLEANS[value.lower()] if kinds[name] is bool else kinds[name](value)
+            chosen[name] = _value(known[name], value)
         except (ValueError, KeyError):
-            raise InputError(f"--set {text}: expected {name}={kinds[name].__name__}") from None
+            raise InputError(f"--set {text}: expected {name}={_value_name(known[name])}") from None
     try:
         return kind(**chosen)
     except ValueError as error:

@@ -12,7 +12,9 @@ from bayes3d_ros.cli.options import (
     ANY,
     FOLDER,
     CommandWithSettings,
+    check_type_names,
     device_option,
+    names_in,
     seed_option,
     settings_from,
     settings_option,
@@ -52,6 +54,18 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
     "steadier.",
 )
 @click.option("--max-objects", type=int, help="Most objects a scene may hold.")
+@click.option(
+    "--types",
+    callback=lambda ctx, parameter, value: names_in(value),
+    metavar="NAME,...",
+    help="Types of the library to look for; objects of other types count as unknown. Default: all.",
+)
+@click.option(
+    "--region",
+    type=(float, float, float, float),
+    metavar="X_MIN X_MAX Y_MIN Y_MAX",
+    help="The part of the table on which objects are looked for, metres in the table's frame. Default: all of it.",
+)
 @settings_option("parser")
 @click.option(
     "--camera-pose-sigma",
@@ -79,8 +93,7 @@ def parse(
     """Parse every depth frame of BAG into a posterior over scenes.
 
     BAG is an MCAP file, or a rosbag2 folder of such. Results in OUT: scenes.jsonl (the best scene of each frame, and
-    how sure each part of it is), samples.npz (the posterior) a picture of each frame and
-    one of the whole bag.
+    how sure each part of it is), samples.npz (the posterior), a picture of each frame, and summary.png (the whole bag).
     """
     from bayes3d_ros.io.bags import read_frames
     from bayes3d_ros.io.results import SUMMARY_FILE, ResultsWriter
@@ -91,6 +104,7 @@ def parse(
     writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)
     models = load_library(library)
+    check_type_names(settings.types, models)
     frames = read_frames(bag, topic, table_frame)
     click.echo(recording_line(frames))
     results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)

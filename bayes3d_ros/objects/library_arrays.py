@@ -34,6 +34,7 @@ class LibraryArrays(NamedTuple):
     """
 
     num_types: Int[Array, ""]
+    possible: Bool[Array, "K"]  # types that the prior allows, at least one; no padding
     words: Int[Array, "V"]
     first: Int[Array, "K"]  # index of the type's first voxel
     dims: Int[Array, "K 3"]
@@ -127,6 +128,7 @@ def library_arrays(library: Library) -> LibraryArrays:
 
     return LibraryArrays(
         num_types=jnp.int32(count),
+        possible=jnp.arange(padded) < count,
         words=jnp.asarray(words),
         first=stack(list(first[:count]), np.int32),
         dims=stack([np.array(m.occupancy.shape) for m in models], np.int32),
@@ -144,6 +146,11 @@ def library_arrays(library: Library) -> LibraryArrays:
         alike_face=stack([a.face for a in alike], np.int32),
         alike_shift=stack([a.shift for a in alike]),
     )
+
+
+def possible_first(library: LibraryArrays) -> tuple[Int[Array, "K"], Int[Array, ""]]:
+    """All types, those that the prior allows before the others; and how many the former are."""
+    return jnp.argsort(~library.possible, stable=True), library.possible.sum()
 
 
 def _solid(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:

@@ -3,6 +3,7 @@
 """Voxel models of objects, and libraries of them. `store.py` keeps them in files."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,7 @@ from bayes3d_ros.geometry.voxels import MAX_VOXELS
 
 _SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
+_NAMES_TOLD = 6  # of a library, in a line about a name that it does not hold
 UNKNOWN = "unknown"  # the type of things of no type in the library: no model may have this name, in any case
 
 
@@ -122,6 +124,16 @@ class Library:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(m.name for m in self.models)
+
+
+def check_types(types: Sequence[str], library: Library) -> None:
+    """Raise ValueError, in one line, where a library holds no type of one of these names."""
+    for name in types:
+        if name not in library.names:
+            reserved = " (whether things may be unknown is the setting unknown)" if is_reserved(name) else ""
+            more = len(library.models) - _NAMES_TOLD
+            held = ", ".join(library.names[:_NAMES_TOLD]) + (f" and {more} more" if more > 0 else "")
+            raise ValueError(f"types names {name!r}, which the library does not hold{reserved}; it holds {held}")
 
 
 def type_names(library: Library, knows_unknown: bool) -> tuple[str, ...]:

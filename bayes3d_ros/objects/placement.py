@@ -2,12 +2,16 @@
 
 """The scene graph of Bayes3D (Methodology, i): a table, and objects that each touch it with one face of their box."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.objects.library_arrays import EMPTY, NUM_FACES, LibraryArrays
+
+LEAST_ROOM = 1e-3  # metres along each axis, that the prior leaves every type and face
+_EVERYWHERE = np.array([[-np.inf, -np.inf], [np.inf, np.inf]], np.float32)  # a region that restricts nothing
 
 
 class Placement(NamedTuple):
@@ -30,10 +34,45 @@ def shifted(placement: Placement, face: Int[Array, "*batch"], shift: Float[Array
 
 
 class Table(NamedTuple):
-    """The table's plane is z = 0 of its frame; the prior area is a rectangle about its origin."""
+    """The table's plane is z = 0 of its frame; the prior area is a rectangle about its origin, or the part of it that
+    lies in a region: a box along the frame's axes."""
 
     T_camera_table: Float[Array, "4 4"]
     size: Float[Array, "2"]
+    region: Float[Array, "2 2"] = cast(Array, _EVERYWHERE)  # least x and y, greatest x and y of box centres
+
+
+def in_region(x: float, y: float, table: Table) -> bool:
+    """Whether a place on the table, metres in its frame, lies in the region."""
+    (left, front), (right, back) = np.asarray(table.region).tolist()
+    return bool(left <= x <= right and front <= y <= back)
+
+
+def moved_into_region(placement: Placement, table: Table) -> Placement:
+    """The nearest placements whose box centre lies in the region."""
+    low, high = table.region
+    x, y = jnp.clip(placement.x, low[0], high[0]), jnp.clip(placement.y, low[1], high[1])
+    return placement._replace(x=x, y=y)
+
+
+def left_out(placement: Placement, library: LibraryArrays, table: Table) -> Bool[Array, "*batch"]:
+    """Whether an object is of a type that is not possible, or stands outside the region."""
+    low, high = table.region
+    at = jnp.stack([placement.x, placement.y], -1)
+    outside = ((at < low) | (at > high)).any(-1)
+    return outside | ((placement.type < library.num_types) & ~library.possible[placement.type])
+
+
+def room(
+    type_id: Int[Array, "*batch"], face: Int[Array, "*batch"], library: LibraryArrays, table: Table
+) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2"]]:
+    """The least and the greatest x and y, metres, that the prior allows an object's box centre: the table's rectangle
+    shrunk by the face's width and height, and of it what lies in the region. It is never narrower than LEAST_ROOM:
+    where a face is wider than the table it is about the middle, where the region holds none of it at its border."""
+    half = jnp.maximum(table.size - library.face_size[type_id, face], LEAST_ROOM) / 2
+    lowest, highest = table.region
+    low = jnp.minimum(jnp.maximum(-half, lowest), highest - LEAST_ROOM)
+    return low, jnp.maximum(jnp.minimum(half, highest), low + LEAST_ROOM)
 
 
 def T_table_object(placement: Placement, library: LibraryArrays) -> Float[Array, "*batch 4 4"]:
@@ -59,13 +98,14 @@ def T_camera_object(placement: Placement, library: LibraryArrays, table: Table) 
 
 
 def log_prior(placement: Placement, library: LibraryArrays, table: Table) -> Float[Array, "*batch"]:
-    """log p(type, face, x, y, yaw): uniform over types and faces, over the table's rectangle shrunk by the face's width
-    and height, and over [0, 2 pi). Density per metre^2 and radian. Minus infinity outside. It is p(o_i, c_i, phi_i) of
-    Bayes3D (Methodology, A (i); lines 4 to 6 of its Algorithm 1)."""
-    free = jnp.maximum(table.size - library.face_size[placement.type, placement.face], 1e-3)
-    inside = (jnp.abs(placement.x) <= free[..., 0] / 2) & (jnp.abs(placement.y) <= free[..., 1] / 2)
-    inside &= (placement.type >= 0) & (placement.type < library.num_types)
-    log_p = -jnp.log(library.num_types * NUM_FACES * free[..., 0] * free[..., 1] * 2 * jnp.pi)
+    """log p(type, face, x, y, yaw): uniform over possible types, faces, the `room` of each and [0, 2 pi). Density per
+    metre^2 and radian. Minus infinity outside. It is p(o_i, c_i, phi_i) of Bayes3D (Methodology, A (i); lines 4 to 6 of
+    its Algorithm 1)."""
+    low, high = room(placement.type, placement.face, library, table)
+    at, free = jnp.stack([placement.x, placement.y], -1), high - low
+    inside = ((low <= at) & (at <= high)).all(-1)
+    inside &= (placement.type >= 0) & (placement.type < library.num_types) & library.possible[placement.type]
+    log_p = -jnp.log(library.possible.sum() * NUM_FACES * free[..., 0] * free[..., 1] * 2 * jnp.pi)
     return jnp.where(inside, log_p, -jnp.inf)
 
 

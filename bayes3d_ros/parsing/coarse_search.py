@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
+from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays, possible_first
 from bayes3d_ros.objects.placement import Placement, T_camera_object, Table
 from bayes3d_ros.parsing.surface_samples import NEAREST, pixels_of
 from bayes3d_ros.parsing.tuning import SEARCH
@@ -126,20 +126,32 @@ def cells_to_search(
     size = 2 * SEARCH.gathered + 1
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (size, size), (1, 1), "SAME")
     apart = _distance((counts > 0) & (near >= SEARCH.fewest_unexplained))
+    apart = jnp.where(_cells_of_region(table, shape), apart, jnp.inf)
     # Of cells at the same distance, those with the most returns first.
     order = -apart + jnp.minimum(near, 1e3) * 1e-5
     best, where = jax.lax.top_k(order.ravel(), min(SEARCH.most_cells, shape[0] * shape[1]))
     centre = (jnp.stack([where // shape[1], where % shape[1]], -1) + 0.5) * SEARCH.cell - table.size / 2
+    centre = jnp.clip(centre, *table.region)
     distance = apart.ravel()[where]
-    real = (jnp.arange(library.first.shape[0]) < library.num_types)[:, None]
-    farthest = jnp.where(real, reach(library), 0.0).max()
+    farthest = jnp.maximum(reach(library).max(), 0.0)
     return CellsInReach(centre, distance, (distance <= farthest).sum())
 
 
 def reach(library: LibraryArrays) -> Float[Array, "K 6"]:
     """How far along the table, in metres, an object's centre may be from one of its returns: half a diagonal of the
-    face that it stands on, plus the diagonal of a cell."""
-    return 0.5 * jnp.linalg.norm(library.face_size, axis=-1) + 2**0.5 * SEARCH.cell
+    face that it stands on, plus the diagonal of a cell. Minus infinity for types that the prior leaves out: they are
+    not looked for."""
+    far = 0.5 * jnp.linalg.norm(library.face_size, axis=-1) + 2**0.5 * SEARCH.cell
+    return jnp.where(library.possible[:, None], far, -jnp.inf)
+
+
+def _cells_of_region(table: Table, shape: tuple[int, int]) -> Bool[Array, "X Y"]:
+    """The cells of which some part lies in the region."""
+    along = []
+    for axis, count in enumerate(shape):
+        low = jnp.arange(count) * SEARCH.cell - table.size[axis] / 2
+        along.append((low < table.region[1][axis]) & (low + SEARCH.cell > table.region[0][axis]))
+    return along[0][:, None] & along[1]
 
 
 def _distance(source: Bool[Array, "X Y"]) -> Float[Array, "X Y"]:
@@ -220,14 +232,17 @@ def cells_in_turn(
     table: Table,
 ) -> Float[Array, "C K 6 Y"]:
     """Scores of the cells in reach of each type and face, -inf elsewhere. The loop runs over real cells and real
-    types only."""
+    possible types only."""
     types, (face, yaw) = library.first.shape[0], _ways()
     ways = NUM_FACES * SEARCH.yaws
     tolerance, penalty, points = SEARCH.coarse_tolerance, SEARCH.coarse_penalty, SEARCH.coarse_points
     blocks = -(-cells.searched // _CELLS_A_STEP)
     along = [table.T_camera_table[:3, axis] for axis in range(2)]
 
-    def of_type(type_id: Int[Array, ""], scores: Array) -> Array:
+    possible, count = possible_first(library)
+
+    def of_type(number: Int[Array, ""], scores: Array) -> Array:
+        type_id = possible[number]
         zero = jnp.zeros(ways)
         at_origin = Placement(jnp.full(ways, type_id), face, zero, zero, yaw)
         # Turned once for all cells.
@@ -245,14 +260,14 @@ def cells_in_turn(
         return jax.lax.fori_loop(0, blocks, of_block, scores)
 
     scores = jnp.full((cells.centre.shape[0], types, NUM_FACES, SEARCH.yaws), -jnp.inf)
-    scores = jax.lax.fori_loop(0, library.num_types, of_type, scores)
+    scores = jax.lax.fori_loop(0, count, of_type, scores)
     near = cells.distance[:, None, None] <= reach(library)
     return jnp.where(near[..., None], scores, -jnp.inf)
 
 
 def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Float[Array, "X Y"]:
     """How little the image says about a small object in each cell: 1 where it would be hidden, less with each
-    height above the cell at which the camera sees past."""
+    height above the cell at which the camera sees past; 0 outside the region."""
     heights = jnp.array([0.01, 0.02, 0.035, 0.05, 0.07])
     x = (jnp.arange(shape[0]) + 0.5) * SEARCH.cell - table.size[0] / 2
     y = (jnp.arange(shape[1]) + 0.5) * SEARCH.cell - table.size[1] / 2
@@ -260,4 +275,4 @@ def hidden_cells(image: ScoredImage, table: Table, shape: tuple[int, int]) -> Fl
     point = (table.T_camera_table[:3, :3] * grid[..., None, :]).sum(-1) + table.T_camera_table[:3, 3]
     z, u, v, inside = pixels_of(point, image)
     past = inside & (point[..., 2] > NEAREST) & (image.pixel_class[v, u] != NO_RETURN) & (image.depth[v, u] > z + 0.02)
-    return jnp.exp(-1.5 * past.sum(-1))
+    return jnp.where(_cells_of_region(table, shape), jnp.exp(-1.5 * past.sum(-1)), 0.0)

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from bayes3d_ros.geometry.camera import resize_nearest, unproject
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.objects.placement import in_region
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.support_plane import BELOW_TABLE, connected_pieces
 from bayes3d_ros.posterior.types import UnexplainedPlace
@@ -77,7 +78,8 @@ def _places(
     label: Int[np.ndarray, "H W"],
     belongs: Bool[np.ndarray, "H W"],
 ) -> tuple[UnexplainedPlace, ...]:
-    """Connected returns that stand above the table and belong to no surface of the scene."""
+    """Connected returns that stand above the table and belong to no surface of the scene; those whose middle lies in
+    the region."""
     T = seen.T_camera_table
     local = (unproject(depth, seen.camera) - T[:3, 3]) @ T[:3, :3]
     above = local[..., 2]
@@ -93,5 +95,6 @@ def _places(
     for k, count in zip(index, pixels, strict=True):
         if count >= FEWEST_RETURNS:
             x, y, z = local[pieces == k].mean(0).tolist()
-            places.append(UnexplainedPlace(x, y, z, int(count)))
+            if in_region(x, y, seen.table):
+                places.append(UnexplainedPlace(x, y, z, int(count)))
     return tuple(sorted(places, key=lambda place: -place.pixels))

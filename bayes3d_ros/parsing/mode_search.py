@@ -160,7 +160,8 @@ def adapt(
         log_target = gains(draws) + log_prior(draws, library, table)
         log_drawn = jax.nn.logsumexp(log_density_modes(draws, wide), 1)
         log_weight = log_target - log_drawn
-        log_weight = jnp.maximum(log_weight - log_weight.max(), -1e9)
+        best = jnp.maximum(log_weight.max(), -1e9)  # draws that all lie outside the prior must not breed NaN
+        log_weight = jnp.maximum(log_weight - best, -1e9)
         weight = tempered(log_weight[None], SEARCH.pilot_ess * SEARCH.pilot_draws)[0]
         # Tempered weights would share the mass between a mode and another that is hundreds of nats worse.
         component = jax.nn.log_softmax(log_density_modes(draws, wide), 1)

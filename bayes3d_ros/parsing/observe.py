@@ -65,8 +65,13 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
 
 
 def table_of(T_camera_table: Float[np.ndarray, "4 4"], settings: ParserSettings) -> Table:
-    size = jnp.array((settings.table_width, settings.table_depth), jnp.float32)
-    return Table(jnp.asarray(T_camera_table, jnp.float32), size)
+    """The table of a frame, with the area that the prior allows; a region is cut to the table's rectangle."""
+    size = np.array((settings.table_width, settings.table_depth), np.float32)
+    low, high = np.full(2, -np.inf, np.float32), np.full(2, np.inf, np.float32)
+    if settings.region:
+        low, high = (np.clip(settings.region[end::2], -size / 2, size / 2) for end in (0, 1))
+    region = jnp.asarray(np.stack([low, high]), jnp.float32)
+    return Table(jnp.asarray(T_camera_table, jnp.float32), jnp.asarray(size), region)
 
 
 def bare_table(width: int, height: int, settings: ParserSettings) -> tuple[ScoredImage, SharedErrorImage | None, Table]:

@@ -3,8 +3,9 @@
 """Parse one depth frame into a posterior over scenes."""
 
 import contextlib
+import copy
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +17,8 @@ from bayes3d_ros.likelihood import noise_marginal
 from bayes3d_ros.likelihood.image_model import ImageModel, image_model, sample_noise
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
-from bayes3d_ros.objects.library_arrays import library_arrays
-from bayes3d_ros.objects.model import Library, type_names
+from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.objects.model import Library, check_types, type_names
 from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.best_scene import BestScene
@@ -31,7 +32,7 @@ from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
 from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
-from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.settings import PER_FRAME, ParserSettings
 
 
 class SceneParser:
@@ -41,11 +42,19 @@ class SceneParser:
     What is compiled serves every size of image that is scored in arrays of one shape (`padded_height`): with the
     default settings one shape for all images of at least 160 pixels across that are not taller than 4:3, and another
     for taller ones up to 2:3.
+
+    capacity: objects that compiled code has room for, `settings.max_objects` at least; as far may `changed` raise
+    `max_objects`. Each costs a little memory. Raises ValueError where `settings.types` names a type that the library
+    does not hold.
     """
 
-    def __init__(self, library: Library, settings: ParserSettings = ParserSettings()) -> None:
+    def __init__(
+        self, library: Library, settings: ParserSettings = ParserSettings(), capacity: int | None = None
+    ) -> None:
+        check_types(settings.types, library)
         self.library, self.settings = library, settings
-        self._arrays = library_arrays(library)
+        self.capacity = max(capacity or 0, settings.max_objects)
+        self._arrays = _of_types(library_arrays(library), library, settings.types)
         self._grid = noise_marginal.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
         self._sample_noise = jax.jit(sample_noise)
@@ -62,6 +71,21 @@ class SceneParser:
         none after `warm_up`, and after a frame in which two or more objects were found."""
         return array_shape(width, height, self.settings.score_width) in self._compiled
 
+    def changed(self, settings: ParserSettings) -> "SceneParser":
+        """A parser with other `types`, `region` or `max_objects`, for which nothing is compiled; this one stays as it
+        is. Raises ValueError, in one line, where another setting differs, where there is no room for `max_objects`, and
+        where the library does not hold one of the types."""
+        other = [f.name for f in fields(settings) if getattr(settings, f.name) != getattr(self.settings, f.name)]
+        if compiled := [name for name in other if name not in PER_FRAME]:
+            raise ValueError(f"{compiled[0]} cannot be changed in a parser, only {', '.join(PER_FRAME)}")
+        if settings.max_objects > self.capacity:
+            raise ValueError(f"max_objects must be at most {self.capacity}, the parser's capacity")
+        check_types(settings.types, self.library)
+        parser = copy.copy(self)  # what is compiled, and for which images, is the same
+        parser.settings = settings
+        parser._arrays = _of_types(self._arrays, self.library, settings.types)
+        return parser
+
     def warm_up(self, width: int, height: int) -> None:
         """Compile for images of this size (values of the intrinsics do not matter) with a made-up image: a bare table
         seen by a camera 0.8 m above it, which takes no search. Returns at once where that has been done."""
@@ -69,9 +93,10 @@ class SceneParser:
             return
         image, errors, table = bare_table(width, height, self.settings)
         context, model = self._context(image, errors, table)
+        full = self.changed(replace(self.settings, max_objects=self.capacity))
         with contextlib.suppress(ParseError):  # a fixed number of objects is not found
-            self._sample(frame_key(0, 0), context, model)
-        self._refreshed(frame_key(0, 0), self._empty(context, model), self.settings.max_objects, context, model)
+            full._sample(frame_key(0, 0), context, model)
+        full._refreshed(frame_key(0, 0), self._empty(context, model), self.capacity, context, model)
         compile_rendering(self._arrays)
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
@@ -161,7 +186,7 @@ class SceneParser:
 
     def _empty(self, context: Context, model: ImageModel) -> smc.Population:
         settings = self.settings
-        slots = max(settings.max_objects, 1)
+        slots = max(self.capacity, 1)
         return smc.init(context, model, settings.particles, slots, self._table_size, settings.window)
 
     def _refreshed(
@@ -191,13 +216,16 @@ class SceneParser:
     ) -> Stage:
         """The scenes of `count` known objects, with noise and unknown things sampled. If the stage's posterior
         mass is negligible (`matters` is false), only its evidence is kept."""
+        slots = max(self.settings.max_objects, 1)  # those beyond are empty
         if not matters:
-            return Stage.without_scenes(float(state.log_evidence), state.objects.x.shape[1])
+            return Stage.without_scenes(float(state.log_evidence), slots)
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
         objects, gauss, log_weight, noise, log_evidence, lineage = jax.device_get(
             (state.objects, gauss, state.log_weight, noise, state.log_evidence, state.lineage)
         )
+        objects, lineage = jax.tree.map(lambda a: a[:, :slots], (objects, lineage))
+        gauss = gauss[:, : slots + 1]
         things: list[tuple[UnknownThing, ...]] = [()] * len(log_weight)
         stage = Stage(objects, gauss, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), things, lineage)
         return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
@@ -251,6 +279,13 @@ class SceneParser:
         )
         label = np.append(0, labels).astype(np.uint16)[label]
         return scene.with_things(frame, seen, depth, label)
+
+
+def _of_types(arrays: LibraryArrays, library: Library, types: tuple[str, ...]) -> LibraryArrays:
+    """The library with these types as the possible ones; all of them where none is named."""
+    possible = np.zeros(len(arrays.possible), bool)
+    possible[[library.names.index(name) for name in types or library.names]] = True
+    return arrays._replace(possible=jnp.asarray(possible))
 
 
 def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M1 3"]:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, Table
+from bayes3d_ros.objects.library_arrays import NUM_FACES, LibraryArrays, possible_first
+from bayes3d_ros.objects.placement import Placement, Table, room
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.sampling import student_t
 
@@ -61,14 +61,16 @@ def propose(key: PRNGKeyArray, proposal: Proposal, count: int, library: LibraryA
     """`count` objects from the whole proposal; yaw in [0, 2 pi)."""
     keys = jax.random.split(key, 8)
     mode = draw_modes(keys[0], proposal.modes, count)
-    type_id = jax.random.randint(keys[1], (count,), 0, library.num_types)
+    types, possible = possible_first(library)
+    type_id = types[jax.random.randint(keys[1], (count,), 0, possible)]
     face = jax.random.randint(keys[2], (count,), 0, NUM_FACES)
     yaw = jax.random.uniform(keys[3], (count,), maxval=2 * jnp.pi)
     cell = jax.random.categorical(keys[4], jnp.log(proposal.cells.ravel()), shape=(count,))
     index = jnp.stack([cell // proposal.cells.shape[1], cell % proposal.cells.shape[1]], -1)
     corner = index * SEARCH.cell - table.size / 2
     hidden = corner + SEARCH.cell * jax.random.uniform(keys[5], (count, 2))
-    anywhere = (jax.random.uniform(keys[6], (count, 2)) - 0.5) * (table.size - library.face_size[type_id, face])
+    low, high = room(type_id, face, library, table)
+    anywhere = (low + high) / 2 + (jax.random.uniform(keys[6], (count, 2)) - 0.5) * (high - low)
     source = jax.random.choice(keys[7], 3, (count,), p=proposal.shares)
     floor = jnp.where((source == 1)[:, None], hidden, anywhere)
     drawn = Placement(type_id, face, floor[:, 0], floor[:, 1], yaw)
@@ -127,15 +129,17 @@ def log_density(placement: Placement, proposal: Proposal, library: LibraryArrays
     inside = ((index >= 0) & (index < shape)).all(-1)
     index = jnp.clip(index, 0, shape - 1)
     log_share = jnp.log(proposal.shares)
-    log_discrete = -jnp.log(library.num_types * NUM_FACES * 2 * jnp.pi)
+    log_discrete = -jnp.log(library.possible.sum() * NUM_FACES * 2 * jnp.pi)
+    possible = library.possible[placement.type]
     hidden = jnp.log(proposal.cells[index[:, 0], index[:, 1]]) - 2 * jnp.log(SEARCH.cell)
-    free = table.size - library.face_size[placement.type, placement.face]
-    anywhere = (jnp.abs(jnp.stack([placement.x, placement.y], -1)) <= free / 2).all(-1)
+    low, high = room(placement.type, placement.face, library, table)
+    at, free = jnp.stack([placement.x, placement.y], -1), high - low
+    anywhere = ((low <= at) & (at <= high)).all(-1) & possible
     return jax.nn.logsumexp(
         jnp.stack(
             [
                 jax.nn.logsumexp(at_mode, 1) + log_share[0],
-                jnp.where(inside, hidden + log_discrete + log_share[1], -jnp.inf),
+                jnp.where(inside & possible, hidden + log_discrete + log_share[1], -jnp.inf),
                 jnp.where(anywhere, -jnp.log(free[:, 0] * free[:, 1]) + log_discrete + log_share[2], -jnp.inf),
             ]
         ),

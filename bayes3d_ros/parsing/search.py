@@ -20,7 +20,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, near_peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, log_prior, overlap
+from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_into_region, overlap
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     UnexplainedReturns,
@@ -161,6 +161,7 @@ def candidates(
     x, y = cells.centre[cell].T
     placement = Placement(type_id, face, x, y, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
     placement, information = align(placement, returns, image, library, table)
+    placement = moved_into_region(placement, table)  # what stands across its border is seen to stand outside
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
     score = surface_score(
@@ -217,7 +218,8 @@ def find_proposal(
     log_q = log_density(pilots.placement, proposal, library, table)
     log_ratio = pilots.log_target - log_q
     path = exponents(log_ratio, log_q - pilots.log_drawn, SAMPLER.planned_levels, SAMPLER.step_keeps)
-    return proposal, jnp.where(worth, path, jnp.ones(SAMPLER.planned_levels))
+    planned = worth & jnp.isfinite(log_ratio).any()  # no pilot may have met the prior
+    return proposal, jnp.where(planned, path, jnp.ones(SAMPLER.planned_levels))
 
 
 def _rough_gains(depth: Float[Array, "Hp Wp"], context: Context, noise: Noise, window: int) -> Gains:
@@ -325,12 +327,14 @@ def _marginal_gains(
     model: ImageModel, loglik_grid: Float[Array, "S P"], scene: LeadScene, context: Context, window: int
 ) -> Gains:
     """Log likelihoods of the scene with one more object, with the nodes of a model, or of a part of it, integrated
-    out. loglik_grid: log likelihoods of the scene at these nodes."""
+    out; -inf of what the prior leaves out, whose modes would take the place of others. loglik_grid: log likelihoods of
+    the scene at these nodes."""
 
     def marginal(placement: Placement) -> Float[Array, "N"]:
         ancestor = jnp.zeros(placement.type.shape, jnp.int32)
         gained, _ = gain(model, placement, ancestor, scene.depth[None], context, window)
-        return log_marginal(model, loglik_grid + gained)
+        value = log_marginal(model, loglik_grid + gained)
+        return jnp.where(left_out(placement, context.library, context.table), -jnp.inf, value)
 
     return marginal
 

@@ -10,6 +10,9 @@ connected region of such returns is a thing, or outliers, with
 
 where the last term is the prior of one more thing. A thing is described by a box: upright, about its visible part, on
 the table. How far the box extends behind is uniform between the visible depth and the larger of the visible sides.
+
+Where the prior has a region, a thing whose middle lies outside is neither reported nor counted; its returns stay what
+they are to any scene: those of such a thing, or outliers.
 """
 
 from collections.abc import Sequence
@@ -27,6 +30,7 @@ from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.likelihood.shared_errors import OUTLINE_NATS
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, stands_in_front
+from bayes3d_ros.objects.placement import in_region
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
 from bayes3d_ros.parsing.support_plane import connected_pieces
@@ -65,7 +69,8 @@ def find_things(
     seed: int,
 ) -> ThingsOfScenes:
     """Sample the unknown things of each scene. scenes: depth as the camera shows it; log_prior: of one more thing;
-    room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds."""
+    room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds. A thing whose
+    middle lies outside the region is not counted."""
     rng = np.random.default_rng(seed)
     known: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
@@ -77,6 +82,9 @@ def find_things(
         here: list[UnknownThing] = []
         for thing in sorted(known[key], key=lambda thing: -thing.log_gain):
             odds, full = thing.log_gain + log_prior, len(here) >= room
+            if not in_region(thing.centre[0], thing.centre[1], seen.table):
+                log_weight[n] += float(np.logaddexp(odds, 0.0)) - thing.log_gain
+                continue
             # The likelihood has counted the thing's gain. Replace it by the sum over thing and outliers; if `exactly`,
             # by the thing's odds; if the scene is full, by outliers'.
             either = odds if exactly else float(np.logaddexp(odds, 0.0))

@@ -32,8 +32,8 @@ _REPORT_PERIOD = 1.0  # seconds between two messages on /diagnostics
 class DepthNodeParts:
     """The parameters of a node, its inputs with their counts, and its report on /diagnostics once a second.
 
-    `report` makes the message. `changed(names)` is called after parameters have been set; `forbids(names)` says before
-    that why they may not be set now, or is empty.
+    `report` makes the message. `changed(names)` is called after parameters have been set; `forbids(parameters)` says
+    before that why they may not be set now, or is empty: their values may be of any type.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class DepthNodeParts:
         *,
         report: Callable[[], DiagnosticArray],
         changed: Callable[[set[str]], None],
-        forbids: Callable[[list[str]], str] = lambda names: "",
+        forbids: Callable[[list[Parameter]], str] = lambda parameters: "",
     ) -> None:
         self._node, self._changed, self._forbids = node, changed, forbids
         self.settings = SettingsParameters(node, kinds)
@@ -95,7 +95,7 @@ class DepthNodeParts:
         return True
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        reason = self._forbids([p.name for p in parameters])
+        reason = self._forbids(parameters)
         return SetParametersResult(successful=False, reason=reason) if reason else self.settings.check(parameters)
 
     def _after_set_parameters(self, parameters: list[Parameter]) -> None:
@@ -117,7 +117,7 @@ class InferenceParts(DepthNodeParts):
         *,
         report: Callable[[], DiagnosticArray],
         changed: Callable[[set[str]], None],
-        forbids: Callable[[list[str]], str] = lambda names: "",
+        forbids: Callable[[list[Parameter]], str] = lambda parameters: "",
     ) -> None:
         self.health = Health()
         self.refusal = ""

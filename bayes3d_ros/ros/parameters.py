@@ -26,6 +26,7 @@ from bayes3d_ros.settings import (
     ParserSettings,
     TrackerSettings,
     UnfinishedSettings,
+    element_type,
     retirement,
     setting,
     validate,
@@ -351,16 +352,26 @@ def _typed(field: Field, value: Any) -> Any:
             raise ValueError(f"{field.name} must be finite, got {value}")
         return float(value)
     if expected is tuple:
-        values = [] if value is None else value
-        if isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
-            raise ValueError(f"{field.name} must be a list of numbers, got {value!r}")
-        try:
-            return tuple(float(v) for v in values)
-        except (TypeError, ValueError):
-            raise ValueError(f"{field.name} must be a list of numbers, got {value!r}") from None
+        return _typed_list(field, [] if value is None else value)
     if type(value) is not expected:
         raise ValueError(f"{field.name} must be of type {expected.__name__}, got {value!r}")
     return value
+
+
+def _typed_list(field: Field, values: Any) -> tuple:
+    """A list's elements as the setting's. ValueError naming the setting."""
+    names = element_type(field) is str
+    wrong = ValueError(f"{field.name} must be a list of {'names' if names else 'numbers'}, got {values!r}")
+    if isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
+        raise wrong
+    if names:
+        if not all(isinstance(v, str) for v in values):
+            raise wrong
+        return tuple(values)
+    try:
+        return tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        raise wrong from None
 
 
 def yaml_text(node_name: str, kinds: tuple[type, ...]) -> str:

@@ -27,8 +27,11 @@ class Parser(Protocol):
 
     def parse(self, frame: DepthFrame) -> ScenePosterior: ...
 
+    def changed(self, settings: ParserSettings) -> "Parser": ...
 
-MakeParser = Callable[[Library, ParserSettings], Parser]
+
+MakeParser = Callable[[Library, ParserSettings, int], Parser]  # the last: its capacity, in objects
+LEAST_CAPACITY = 12  # objects that a node compiles for
 
 
 class ParserBundle(NamedTuple):
@@ -46,10 +49,11 @@ def types_of(parser: Parser) -> tuple[str, ...]:
 
 
 def make_bundle(
-    make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int]
+    make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int], capacity: int
 ) -> ParserBundle:
-    """Compile for images of a size (width, height; none if one is 0). Takes seconds to minutes."""
-    parser = make_parser(library, settings)
+    """Compile for images of a size (width, height; none if one is 0) and scenes of up to `capacity` objects. Takes
+    seconds to minutes."""
+    parser = make_parser(library, settings, capacity)
     if all(size):
         parser.warm_up(*size)
     return ParserBundle(parser, SceneMarkers(library), CollisionMeshes(library), jax.default_backend())

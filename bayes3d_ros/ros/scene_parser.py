@@ -8,10 +8,11 @@ from dataclasses import fields, replace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.objects.model import Library, LibraryError
+from bayes3d_ros.objects.model import Library, LibraryError, check_types
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.collision_scene import check_frame
 from bayes3d_ros.posterior.object_ids import IdMemory, named
@@ -33,15 +34,16 @@ from bayes3d_ros.ros.parameters import (
 )
 from bayes3d_ros.ros.parse_requests import ParseAnswer
 from bayes3d_ros.ros.parse_service import ParseService
-from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, make_bundle, types_of
+from bayes3d_ros.ros.parser_bundle import LEAST_CAPACITY, MakeParser, ParserBundle, make_bundle, types_of
+from bayes3d_ros.ros.parser_in_use import ParserInUse
 from bayes3d_ros.ros.planning_scene import PlanningScenePublisher
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.scene_outputs import ToldScene
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.summary import found_words, key_values
-from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.settings import PER_FRAME, ParserSettings
 
-_PARSER_PARAMETERS = {f.name for f in fields(ParserSettings)}
+_COMPILED = {f.name for f in fields(ParserSettings)} - {*PER_FRAME}  # a parser is made for these
 _CANNOT_COMPILE = "cannot compile the parser"
 
 _PURPOSE = "Depth images in, posteriors over 3D tabletop scenes out: which objects stand where, and how sure that is."
@@ -62,9 +64,11 @@ class SceneParserNode(Node):
             remedy="call ~/reload_library or configure again",
             report=self._report,
             changed=self._parameters_changed,
-            forbids=self._why_fixed,
+            forbids=self._why_not_set,
         )
-        self._ready: ParserBundle | None = None  # replaced as a whole; the worker reads it once a frame
+        self._in_use = ParserInUse()
+        self._libraries: tuple[Library, ...] = ()  # of the parser in use, and of the one that is prepared
+        self._capacity = LEAST_CAPACITY
         self._frames: OutputFrames | None = None  # there while inputs are; likewise
         self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
         self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
@@ -84,7 +88,9 @@ class SceneParserNode(Node):
         """Load the library and compile, unless that has been done already."""
         try:
             if self._ready is None:
-                self._ready = make_bundle(self._make_parser, *self._load(), self._size())
+                library, settings = self._load()
+                self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
+                self._libraries = (library,)
         except (ValueError, LibraryError) as error:
             self._parts.refuse(str(error))
             return TransitionCallbackReturn.FAILURE
@@ -112,7 +118,8 @@ class SceneParserNode(Node):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the parser."""
-        self._ready = None
+        self._in_use.forget()
+        self._libraries, self._capacity = (), LEAST_CAPACITY
         self._requests += 1  # a parser on its way is not wanted any more
         self._preparing_since = None
         return super().on_cleanup(state)
@@ -135,11 +142,23 @@ class SceneParserNode(Node):
 
     # Preparing a parser
 
+    @property
+    def _ready(self) -> ParserBundle | None:
+        return self._in_use.bundle
+
     def _load(self) -> tuple[Library, ParserSettings]:
-        """The library and settings that the parameters name. Raises ValueError, LibraryError."""
+        """The library and settings that the parameters name, which a parser may be made of. Raises ValueError,
+        LibraryError."""
         folder = self._parts.settings.read(SceneParserNodeSettings).library
         settings = self._parts.settings.read(ParserSettings)
-        return library_in(folder), settings
+        library = library_in(folder)
+        try:
+            check_types(settings.types, library)
+        except ValueError as error:
+            raise ValueError(f"parameter {error} ({folder})") from None
+        self._in_use.adjust(settings)
+        self._capacity = max(self._capacity, settings.max_objects)
+        return library, settings
 
     def _size(self) -> tuple[int, int]:
         settings = self._parts.settings.read(SceneParserNodeSettings)
@@ -154,7 +173,8 @@ class SceneParserNode(Node):
                 self._parts.refuse(str(error))
             return str(error)
         self._requests += 1
-        request = self._requests
+        request, capacity = self._requests, self._capacity
+        self._libraries = (*(() if self._ready is None else (self._ready.parser.library,)), library)
         self._preparing_since = time.monotonic()
         self._parts.refusal = ""
         self.get_logger().info(f"preparing a parser for {len(library.models)} object types")
@@ -163,11 +183,13 @@ class SceneParserNode(Node):
             if request != self._requests:
                 return  # a later request is on its way
             try:
-                bundle, refusal = make_bundle(self._make_parser, library, settings, size), ""
+                bundle, refusal = make_bundle(self._make_parser, library, settings, size, capacity), ""
             except Exception as error:
                 bundle, refusal = None, self._parts.failure(_CANNOT_COMPILE, error)
             if request == self._requests:  # else nobody wants it any more
-                self._ready, self._parts.refusal = bundle or self._ready, refusal
+                if bundle is not None:
+                    self._in_use.put(bundle)
+                self._parts.refusal = refusal
                 self._prepared.trigger()
 
         self._parts.worker.call(job)
@@ -179,6 +201,7 @@ class SceneParserNode(Node):
             return  # a cleanup came first
         seconds = time.monotonic() - self._preparing_since
         self._preparing_since = None
+        self._libraries = () if self._ready is None else (self._ready.parser.library,)
         state = self._state_label()
         if self._parts.refusal:
             self.get_logger().error(self._parts.refusal)
@@ -228,16 +251,34 @@ class SceneParserNode(Node):
             self._planning.close()
             self._planning = None
 
-    def _why_fixed(self, names: list[str]) -> str:
-        fixed = [name for name in names if name in FIXED_WHILE_ACTIVE]
-        return f"{fixed[0]}: deactivate the node first" if fixed and self._parts.inputs is not None else ""
+    @property
+    def _begun(self) -> bool:
+        """Whether a parser is there or on its way."""
+        return self._ready is not None or self._preparing_since is not None
+
+    def _why_not_set(self, parameters: list[Parameter]) -> str:
+        """Why values may not be set now; empty where they may, as far as their types do not forbid it."""
+        values = {p.name: p.value for p in parameters}
+        fixed = [name for name in values if name in FIXED_WHILE_ACTIVE]
+        if fixed and self._parts.inputs is not None:
+            return f"{fixed[0]}: deactivate the node first"
+        most, types = values.get("max_objects"), values.get("types")
+        if self._begun and isinstance(most, int) and most > self._capacity:
+            return f"max_objects must be at most {self._capacity} until the node is cleaned up, got {most}"
+        try:
+            for library in self._libraries:
+                check_types(types if isinstance(types, (list, tuple)) else (), library)
+        except ValueError as error:
+            return str(error)
+        return ""
 
     def _parameters_changed(self, names: set[str]) -> None:
         if "mode" in names:
             self._parts.health.begin()
-        begun = self._ready is not None or self._preparing_since is not None
-        if begun and names & _PARSER_PARAMETERS:
+        if self._begun and names & _COMPILED:
             self._prepare()
+        elif self._begun and names & {*PER_FRAME}:
+            self._in_use.adjust(self._parts.settings.in_use(ParserSettings))
         if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:
             self._close_inputs()
             self._open_inputs()

@@ -10,7 +10,18 @@ import trimesh
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
-from bayes3d_ros.objects.placement import Placement, T_camera_object, T_table_object, Table, log_prior, overlap
+from bayes3d_ros.objects.placement import (
+    LEAST_ROOM,
+    Placement,
+    T_camera_object,
+    T_table_object,
+    Table,
+    in_region,
+    log_prior,
+    moved_into_region,
+    overlap,
+    room,
+)
 
 BOWL, BOX, SPHERE = 0, 1, 3
 
@@ -107,6 +118,54 @@ def test_the_prior_integrates_to_one(arrays):
     per_face = density.sum((2, 3)) * step**2 * 2 * np.pi
     np.testing.assert_allclose(per_face[:5], 1 / 30, rtol=0.05)  # every type and face alike
     assert (per_face[5:] == 0).all()  # types that only pad the arrays
+
+
+def test_a_restricted_prior_integrates_to_one(arrays, library):
+    """Over the types that are possible and, of each face, over what lies in the region and in the shrunk rectangle."""
+    region = np.array([[-0.03, 0.02], [0.18, 0.3]])  # cut by the table's edge at y = 0.2
+    table = table_of(0.5, 0.4)._replace(region=jnp.asarray(region, jnp.float32))
+    some = arrays._replace(possible=jnp.zeros(8, bool).at[jnp.array([BOX, SPHERE])].set(True))
+    step = 0.0025
+    x, y = np.arange(-0.3, 0.3, step) + step / 2, np.arange(-0.3, 0.3, step) + step / 2
+    type_id, face, x, y = np.meshgrid(np.arange(8), np.arange(6), x, y, indexing="ij")
+    density = np.exp(np.asarray(log_prior(placement(type_id, face, x, y, 1.0), some, table), np.float64))
+    mass = density.sum((2, 3)) * step**2 * 2 * np.pi
+    np.testing.assert_allclose(mass[[BOX, SPHERE]], 1 / 12, rtol=0.06)  # a cell at the rim counts or not
+    assert (np.delete(mass, [BOX, SPHERE], 0) == 0).all()
+    inside = density > 0
+    assert (x[inside] >= -0.03).all() and (x[inside] <= 0.18).all() and (y[inside] >= 0.02).all()
+    size = library.models[BOX].box_size[[1, 2]]
+    high = np.minimum([0.18, 0.3], (np.array([0.5, 0.4]) - size) / 2)
+    expected = -np.log(2 * 6 * (high - region[0]).prod() * 2 * np.pi)
+    assert float(log_prior(placement(BOX, 0, 0.0, 0.03), some, table)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_region_of_the_whole_table_restricts_nothing(arrays):
+    rng = np.random.default_rng(0)
+    somewhere = placement(rng.integers(0, 5, 500), rng.integers(0, 6, 500), *rng.uniform(-0.3, 0.3, (2, 500)))
+    table = table_of(0.5, 0.4)
+    whole = table._replace(region=jnp.array([[-0.25, -0.2], [0.25, 0.2]]))
+    np.testing.assert_array_equal(log_prior(somewhere, arrays, table), log_prior(somewhere, arrays, whole))
+
+
+def test_room_is_left_where_a_region_holds_only_the_rim(arrays):
+    """Where no object of a face stands on the table as a whole: at the region's border that is nearest to it."""
+    rim = jnp.array([[0.22, -0.1], [0.25, 0.1]])
+    low, high = map(
+        np.asarray, room(jnp.asarray(KINDS), jnp.asarray(FACES), arrays, table_of(0.5, 0.4)._replace(region=rim))
+    )
+    assert (low[:, 0] == np.float32(0.22)).all() and (high - low >= LEAST_ROOM - 1e-6).all()
+    assert (high[:, 0] <= 0.25).all()
+
+
+def test_what_lies_in_the_region(arrays):
+    table = table_of(0.5, 0.4)._replace(region=np.array([[-0.1, 0.0], [0.1, 0.2]]))
+    x, y = np.array([0.0, -0.2, 0.05, 0.0]), np.array([0.1, 0.1, 0.3, -0.1])
+    assert [in_region(*place, table) for place in zip(x, y, strict=True)] == [True, False, False, False]
+    moved = moved_into_region(placement(BOX, 0, x, y), table)
+    np.testing.assert_allclose(moved.x, [0, -0.1, 0.05, 0], rtol=1e-6)
+    np.testing.assert_allclose(moved.y, [0.1, 0.1, 0.2, 0], rtol=1e-6)
+    assert in_region(0.3, -0.3, table_of(0.5, 0.4))
 
 
 def test_the_prior_is_uniform_inside_and_nothing_outside(arrays, library):

@@ -18,6 +18,7 @@ from bayes3d_ros.parsing.coarse_search import (
     cell_grid,
     cells_in_turn,
     cells_to_search,
+    hidden_cells,
     reach,
     score_cells,
 )
@@ -59,6 +60,27 @@ def test_compiled_scores_are_those_of_arrays(seed, count, scene, arrays):
     # A point half way between two pixels may fall into either.
     assert (np.abs(fast - slow) < 1e-3 * np.ptp(slow)).mean() > 0.995
     assert np.abs(fast - slow).max() < 1e-3 * np.ptp(slow)  # measured: 2e-7
+
+
+def test_only_possible_types_are_looked_for_where_they_may_be(scene, arrays):
+    """Others are never scored, and cells outside the region are not searched."""
+    image = scene.image(scene.depth(scene.placements((4, 0.02, -0.03, 0.4))))
+    shown = jnp.asarray(np.asarray(image.depth) < np.asarray(image.bare_depth) - 0.01, jnp.float32)
+    returns = UnexplainedReturns(image.depth, shown, 1 - shown)
+    second = arrays._replace(possible=jnp.arange(len(arrays.possible)) == 1)
+    region = np.array([[0.005, -0.05], [0.1, 0.05]])
+    table = scene.table._replace(region=jnp.asarray(region, jnp.float32))
+    shape = cell_grid(tuple(np.asarray(table.size).tolist()))
+    cells = cells_to_search(returns, second, image, table, shape)
+    count = int(cells.searched)
+    searched = np.asarray(cells.centre)[:count]
+    assert count > 10 and (searched >= region[0] - 1e-6).all() and (searched <= region[1] + 1e-6).all()
+    for score in (score_cells, cells_in_turn):
+        scores = np.asarray(jax.jit(score)(cells, returns, image, second, table))
+        assert np.isfinite(scores[:count, 1]).any()
+        assert np.isneginf(np.delete(scores, 1, 1)).all()
+    hidden = np.asarray(hidden_cells(image, table, shape))
+    assert 0 < (hidden > 0).sum() <= 6 * 6
 
 
 def test_distance_to_the_nearest_source_is_that_of_all_pairs() -> None:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood import density
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN, Noise, Pixels
@@ -183,6 +184,41 @@ def test_errors_that_pixels_share():
         assert total_variation(binned(name, mixed[name]), binned(name, getattr(truth, name))) < 0.1
         width, mass = region_against(mixed[name], getattr(truth, name), 0.9)
         assert 0.8 < width < 1.2 and 0.8 < mass < 0.97
+
+
+def restricted_to(problem, found, type_id, left):
+    """log Z of one type at x >= left, from cells enumerated without a restriction: the part of each that lies there,
+    at the density of a prior that is uniform over less."""
+    cells, context = found.cells, problem.context
+    here = np.asarray(cells.placement.type) == type_id
+    x, width = np.asarray(cells.placement.x)[here], cells.width[here, 0]
+    share = np.clip((x + width / 2 - left) / width, 0, 1)
+    size = np.asarray(context.library.face_size)[type_id, np.asarray(cells.placement.face)[here], 0]
+    free = problem.table_size[0] - size
+    denser = np.log(len(problem.library.models) * free / (free / 2 - left))
+    with np.errstate(divide="ignore"):
+        return float(logsumexp(cells.log_mass[here] + np.log(share) + denser)), x, cells.log_mass[here]
+
+
+def test_a_restricted_prior(step):
+    """Of the two bricks the one that is less likely, and of its posterior over x what lies beyond the median: the
+    evidence is that of the prior that is uniform over one type and the region, and every sample lies there."""
+    problem = PROBLEMS["two bricks"]()
+    found = enumerate_object(problem, levels=LEVELS, where=close_to(*true_places(problem)[0]))
+    _, x, log_mass = restricted_to(problem, found, 1, -np.inf)
+    order = np.argsort(x)
+    mass = np.exp(log_mass[order] - log_mass.max()).cumsum()
+    left = float(np.float32(x[order][np.searchsorted(mass, mass[-1] / 2)]))
+    log_truth, _, _ = restricted_to(problem, found, 1, left)
+    context = problem.context
+    region = jnp.array([[left, -1.0], [1.0, 1.0]], jnp.float32)
+    library = context.library._replace(possible=jnp.arange(len(context.library.possible)) == 1)
+    some = problem._replace(context=context._replace(library=library, table=context.table._replace(region=region)))
+    runs = [run(some, seed, PARTICLES, step()) for seed in range(SEEDS)]
+    assert agrees([r.log_evidence[-1] for r in runs], log_truth)
+    for result in runs:
+        held = result.placement.x[result.weight > 0, 0]
+        assert (held >= np.float32(left)).all() and (result.placement.type[result.weight > 0] == 1).all()
 
 
 def test_the_prior_as_an_answer_is_caught(seen, seen_exact):

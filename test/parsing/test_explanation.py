@@ -7,6 +7,7 @@ import pytest
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
+from bayes3d_ros.objects.placement import Table
 from bayes3d_ros.parsing.explanation import FEWEST_RETURNS, explain
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.table_fit import SeenTable
@@ -16,12 +17,14 @@ TABLE_DEPTH, TOP_DEPTH = 1.0, 0.9  # metres
 T_CAMERA_TABLE = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, TABLE_DEPTH], [0, 0, 0, 1]])
 NOISE = 0.001, 0.005  # metres: of the scene, and the largest
 BLOCK = slice(20, 30), slice(10, 20)
+EVERYWHERE = ((-np.inf, -np.inf), (np.inf, np.inf))
 
 
-def seen(depth: np.ndarray, pixel_class: np.ndarray | None = None) -> Observation:
+def seen(depth: np.ndarray, pixel_class: np.ndarray | None = None, region: object = EVERYWHERE) -> Observation:
     pixel_class = np.full(depth.shape, IN_WORKSPACE) if pixel_class is None else pixel_class
     table = SeenTable(T_CAMERA_TABLE, np.zeros(3), np.zeros(3))
-    return Observation(None, None, None, CAMERA, depth, pixel_class, table, 1.0, [])
+    placed = Table(T_CAMERA_TABLE, np.ones(2), np.asarray(region))
+    return Observation(None, None, placed, CAMERA, depth, pixel_class, table, 1.0, [])
 
 
 def bare() -> np.ndarray:
@@ -54,6 +57,17 @@ def test_returns_elsewhere_than_the_scene_puts_them_are_counted_and_located() ->
     x, y = (54.5 - CAMERA.cx) / CAMERA.fx * TOP_DEPTH, -(42.5 - CAMERA.cy) / CAMERA.fy * TOP_DEPTH
     np.testing.assert_allclose(places[0][:3], [x, y, TABLE_DEPTH - TOP_DEPTH], atol=1e-6)
     assert places[1].z == pytest.approx(TABLE_DEPTH - TOP_DEPTH - 0.03)
+
+
+def test_places_outside_the_region_are_not_told() -> None:
+    depth = bare()
+    depth[40:46, 50:60] = TOP_DEPTH
+    x, y = (54.5 - CAMERA.cx) / CAMERA.fx * TOP_DEPTH, -(42.5 - CAMERA.cy) / CAMERA.fy * TOP_DEPTH
+    around = ((x - 0.01, y - 0.01), (x + 0.01, y + 0.01))
+    beside = ((x + 0.01, y - 0.01), (x + 0.03, y + 0.01))
+    nothing = bare(), np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+    for region, told in ((around, 1), (beside, 0)):
+        assert len(explain(seen(depth, region=region), *nothing, 0, NOISE).unexplained) == told
 
 
 def test_what_differs_by_less_than_the_noise_may_is_explained() -> None:

@@ -12,7 +12,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.likelihood import slow_renderer
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.model import Library, check_types
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
@@ -127,13 +127,103 @@ def test_nothing_is_compiled_again(parser, library):
     assert (smc.step._cache_size(), smc.init._cache_size()) == traces
 
 
+ONE_BRICK = [(0, -0.05, 0.03, 0.4)]
+
+
+def counted():
+    """How many times the sampler's parts were traced."""
+    return smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
+
+
+APART = [(0, -0.13, 0.0, 0.4), (1, 0.14, 0.03, 0.2)]  # a brick on the left and a tower on the right
+LEFT, RIGHT, WHOLE = (-0.3, -0.05, -0.3, 0.3), (0.05, 0.3, -0.3, 0.3), (-0.3, 0.3, -0.3, 0.3)
+
+
+def test_types_region_and_most_objects_change_without_compiling(parser, library):
+    observed = frame(library, APART)[0]
+    before = parser.parse(observed)
+    traces, noise = counted(), parser._sample_noise._cache_size()
+    for change, told in (
+        ({"region": LEFT}, ["brick"]),
+        ({"region": RIGHT, "types": ("brick", "tower")}, ["tower"]),
+        ({"region": RIGHT, "types": ("tower",), "max_objects": 1}, ["tower"]),
+        ({"max_objects": 0}, []),
+        ({"max_objects": 2, "region": WHOLE}, ["brick", "tower"]),
+    ):
+        settings = replace(SETTINGS, **change)
+        found = parser.changed(settings).parse(observed)
+        assert found.types == library.names and sorted(o.type for o in found.objects) == told
+        held = found.samples.type >= 0
+        assert found.samples.type.shape[1] == max(settings.max_objects, 1)
+        assert held.sum(1).max() <= settings.max_objects
+        assert {library.names[k] for k in found.samples.type[held]} <= set(settings.types or library.names)
+        x, _ = places(found)
+        left, right = (settings.region or WHOLE)[:2]
+        assert ((left - 0.005 < x) & (x < right + 0.005)).all()  # the table's errors are drawn afterwards
+    assert (counted(), parser._sample_noise._cache_size()) == (traces, noise)
+    assert_same(parser.parse(observed), before)
+
+
+def places(found):
+    """x and y of every object of every sample in the table's frame."""
+    held = found.samples.type >= 0
+    T = np.linalg.inv(found.T_camera_table)
+    return (found.samples.position[held] @ T[:3, :3].T + T[:3, 3]).T[:2]
+
+
+def test_a_region_of_the_whole_table_changes_nothing(parser, library):
+    observed = frame(library, ONE_BRICK)[0]
+    assert_same(
+        parser.changed(replace(SETTINGS, region=(-0.3, 0.3, -0.3, 0.3))).parse(observed), parser.parse(observed)
+    )
+
+
+def test_fewer_objects_than_there_is_room_for_have_the_same_posterior(parser, library):
+    """P(n) is cut and normalised; the stages, of which each number of objects has one, are those of more."""
+    observed = frame(library, ONE_BRICK)[0]
+    many = parser.parse(observed)
+    made, changed = SceneParser(library, replace(SETTINGS, max_objects=1), capacity=3), replace(SETTINGS, max_objects=1)
+    one = parser.changed(changed).parse(observed)
+    assert_same(made.parse(observed), one)
+    of_two = many.num_objects[0] + many.num_objects[1]
+    assert one.num_objects[1] == pytest.approx(many.num_objects[1] / of_two, abs=1e-5)
+    ratio = SETTINGS.count_ratio
+    normalised = np.log(sum(ratio**n for n in range(4)) / (1 + ratio))
+    assert one.log_evidence == pytest.approx(many.log_evidence + np.log(of_two) + normalised, abs=1e-3)
+
+
+def test_what_a_parser_cannot_be_changed_to_is_told_in_one_line(parser, library):
+    names = [f"model_{k}" for k in range(9)]
+    many = Library(tuple(replace(library.models[0], name=name) for name in names))
+    for told, attempt in (
+        ("max_objects must be at most 3", lambda: parser.changed(replace(SETTINGS, max_objects=4))),
+        ("seed cannot be changed", lambda: parser.changed(replace(SETTINGS, seed=1))),
+        ("types names 'mug', .* it holds brick, tower$", lambda: parser.changed(replace(SETTINGS, types=("mug",)))),
+        ("model_5 and 3 more$", lambda: SceneParser(many, replace(SETTINGS, types=("model_1", "mug")))),
+        ("is the setting unknown", lambda: check_types(("unknown",), library)),
+        ("region must", lambda: replace(SETTINGS, region=(0.3, 0.5, 0.0, 0.1))),
+    ):
+        with pytest.raises(ValueError, match=told) as error:
+            attempt()
+        assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("table", ["auto", "pose", "depth"])
 def test_warm_up_compiles_all_that_a_frame_needs(library, table):
     parser = SceneParser(library, replace(SETTINGS, table=table))
     parser.warm_up(CAMERA.width, CAMERA.height)
-    traces = smc.step._cache_size()
+    traces = counted()
     parser.parse(frame(library, [(0, 0.0, 0.0, 0.4)])[0])
-    assert smc.step._cache_size() == traces
+    assert counted() == traces
+
+
+def test_warm_up_compiles_for_more_objects_than_there_are_now(library):
+    settings = replace(SETTINGS, max_objects=0)
+    parser = SceneParser(library, settings, capacity=3)
+    parser.warm_up(CAMERA.width, CAMERA.height)
+    traces = counted()
+    found = parser.changed(SETTINGS).parse(frame(library, [(0, -0.08, 0.0, 0.4), (1, 0.09, 0.05, 0.2)])[0])
+    assert len(found.objects) == 2 and counted() == traces
 
 
 def test_fixed_number_of_objects(library):

@@ -120,6 +120,20 @@ def test_floors(arrays, table):
     np.testing.assert_allclose(anywhere[np.isfinite(prior)], prior[np.isfinite(prior)], rtol=1e-5)
 
 
+def test_draws_follow_a_restricted_prior(arrays, table):
+    """Of the floors, where types and places are restricted: the mean of prior / q over draws is one."""
+    region = jnp.array([[-0.02, 0.01], [0.13, 0.3]])
+    table, one = table._replace(region=region), arrays._replace(possible=jnp.arange(len(arrays.possible)) == 1)
+    p = proposal((0.0, 0.0, 1.0))
+    at = draw(jax.random.key(2), p, 2000, one, table)
+    assert (np.asarray(at.type) == 1).all()
+    np.testing.assert_allclose(density(at, p, one, table), log_prior(at, one, table), rtol=1e-5)
+    p = proposal((0.3, 0.4, 0.3))
+    at = draw(jax.random.key(3), p, COUNT, one, table)
+    ratio = np.exp(np.asarray(log_prior(at, one, table), np.float64) - np.asarray(density(at, p, one, table)))
+    assert ratio.mean() == pytest.approx(1, abs=4 * ratio.std() / np.sqrt(COUNT)) and ratio.std() < 2
+
+
 COUNT = 40000
 
 

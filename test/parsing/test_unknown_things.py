@@ -12,6 +12,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import UNKNOWN, Library
+from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.simulate.ray_casting import RayCaster
@@ -109,6 +110,25 @@ def test_a_fixed_number_counts_every_thing(library):
     posterior = SceneParser(library, replace(SETTINGS, fixed_objects=2)).parse(frame(BRICK, BALL))
     assert posterior.num_objects[2] > 0.999
     assert sorted(o.type for o in posterior.objects) == ["brick", UNKNOWN]
+
+
+def test_what_stands_outside_the_region_is_not_told(parser):
+    """Nor is it counted: the rest is as if it were not there, and nothing is compiled."""
+    traces = smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
+    left = parser.changed(replace(SETTINGS, region=(-0.4, 0.0, -0.4, 0.4))).parse(frame(BRICK, BALL))
+    assert [o.type for o in left.objects] == ["brick"]
+    assert left.num_objects[1] > 0.8 and left.num_unknown[0] > 0.99
+    assert left.unexplained == () and left.warnings == ()
+    right = parser.changed(replace(SETTINGS, region=(0.0, 0.4, -0.4, 0.4))).parse(frame(BRICK, BALL))
+    assert [o.type for o in right.objects] == [UNKNOWN]
+    assert right.num_objects[1] > 0.8 and right.num_unknown[1] > 0.99
+    assert (smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()) == traces
+
+
+def test_what_is_of_a_type_that_is_left_out_is_unknown(parser, library):
+    found = parser.changed(replace(SETTINGS, types=("tower",))).parse(frame(BRICK, BALL))
+    assert [o.type for o in found.objects] == [UNKNOWN, UNKNOWN] and found.types == (*library.names, UNKNOWN)
+    assert not (found.samples.type == library.names.index("brick")).any()
 
 
 def test_no_model_may_have_its_name():

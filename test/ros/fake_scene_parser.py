@@ -3,6 +3,7 @@
 """The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] [--compiling S] --ros-args
 ...`; seconds for every frame, and for the first one of every size."""
 
+import copy
 import sys
 import threading
 
@@ -18,14 +19,20 @@ from bayes3d_ros.settings import ParserSettings
 
 
 class FakeParser:
-    """Answers every frame with one object of type 0, one metre ahead (or at the camera pose's height)."""
+    """Answers every frame with one object, of the first type that it may be of, one metre ahead (or at the camera
+    pose's height)."""
 
     seconds = 0.0
     compiling = 0.0
 
-    def __init__(self, library: Library, settings: ParserSettings) -> None:
-        self.library, self.settings = library, settings
+    def __init__(self, library: Library, settings: ParserSettings, capacity: int) -> None:
+        self.library, self.settings, self.capacity = library, settings, capacity
         self._sizes: set[tuple[int, int]] = set()
+
+    def changed(self, settings: ParserSettings) -> "FakeParser":
+        parser = copy.copy(self)
+        parser.settings = settings
+        return parser
 
     def warm_up(self, width: int, height: int) -> None:
         if not self.compiled_for(width, height):
@@ -43,17 +50,17 @@ class FakeParser:
             raise ParseError("no camera pose for this frame, and table:=pose expects one")
         z = 1.0 if frame.T_table_camera is None else float(frame.T_table_camera[2, 3])
         position, orientation = np.array([0.0, 0.1, z]), np.array([0.0, 0.0, 0.0, 1.0])
+        name = (self.settings.types or self.library.names)[0]
         samples = SceneSamples(  # two samples: one object, none
             log_weight=np.log([0.75, 0.25]),
             num_objects=np.array([1, 0]),
-            type=np.array([[0], [-1]]),
+            type=np.array([[self.library.names.index(name)], [-1]]),
             face=np.array([[5], [-1]]),
             position=np.stack([position, position])[:, None],
             orientation=np.stack([orientation, orientation])[:, None],
             p_outlier=np.full(2, 0.05),
             sigma=np.full(2, 0.002),
         )
-        name = self.library.names[0]
         estimate = ObjectEstimate(name, {name: 1.0}, 0.75, position, orientation, np.diag([1e-6] * 6), 5)
         return ScenePosterior(
             stamp_ns=frame.stamp_ns,

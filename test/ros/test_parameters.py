@@ -55,7 +55,8 @@ def test_the_yaml_file_is_in_step_with_the_settings(node: str) -> None:
     values = yaml.safe_load(expected)["/**"]["ros__parameters"]
     assert values.keys() == {f.name for kind in NODE_SETTINGS[node] for f in fields(kind)}
     core = asdict(NODE_SETTINGS[node][1]())
-    assert {k: repr(values[k]) for k in core} == {k: repr(v) for k, v in core.items()}  # as NaN is not equal to NaN
+    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in core.items()}
+    assert {k: repr(values[k]) for k in core} == {k: repr(v) for k, v in listed.items()}  # as NaN is not equal to NaN
 
 
 def test_defaults_are_the_settings_defaults(declared: tuple[Node, SettingsParameters]) -> None:
@@ -98,6 +99,13 @@ def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, Sett
         with_values("table:=chair"),
         with_values("window:=4"),
         with_values("near:=6.0"),
+        with_values("types:=mug"),
+        with_values("types:=[1, 2]"),
+        with_values("region:=[0.0, 0.1]"),
+        with_values("region:=[0.1, 0.0, 0.0, 0.1]"),
+        with_values("region:=[0.7, 0.9, 0.0, 0.1]"),
+        with_values("region:=[0.0, .inf, 0.0, 0.1]"),
+        with_values("region:=[left, right]"),
         with_values("camera_pose:=[1.0, 2.0]"),
         with_values("camera_pose:=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]"),
         with_values("camera_pose_sigma:=[0.001]"),
@@ -123,6 +131,22 @@ def test_a_bad_value_at_the_start_is_named_in_one_line_and_the_node_lives(
         for kind in SCENE_PARSER_SETTINGS:
             parameters.read(kind)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [with_values("types:=[mug, bowl]", "region:=[0, 0.2, -1, 0.3]"), with_values("types:=[]")],
+    indirect=True,
+)
+def test_lists_may_be_of_names_and_of_numbers(declared: tuple[Node, SettingsParameters]) -> None:
+    node, parameters = declared
+    given = ParserSettings(types=("mug", "bowl"), region=(0.0, 0.2, -1.0, 0.3))
+    assert parameters.read(ParserSettings) in (given, ParserSettings())
+    for values in ({"types": ["mug"], "region": [0.0, 0.1, 0.0, 0.1]}, {"types": [], "region": []}):
+        for result in node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
+            assert result.successful, result.reason
+        read = parameters.read(ParserSettings)
+        assert (list(read.types), list(read.region)) == (values["types"], values["region"])
 
 
 @pytest.mark.parametrize("declared", [with_values("max_objects:=77")], indirect=True)
