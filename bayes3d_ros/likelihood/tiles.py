@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The part of the image that each hypothesis can change, cut into tiles; depth rendered and scored tile by tile.
+"""The part of the image that each hypothesis can change, cut into tiles; depth is rendered and scored tile by tile.
 
-Tiles of all hypotheses form one list, worked through in chunks of static shape, as many as it takes: cost grows with
-the pixels that hypotheses cover. Windows overlap: a tile's neighbours belong to the windows of its pixels too. So each
-hypothesis is rendered once, into an image of its own, and scored from there. The images of a batch fit into a cache,
-those of all would not fit anywhere. `over_depth` is for what the kernels do not do: free points, and backends other
-than CPUs and GPUs.
+Tiles of all hypotheses form one list, which is worked through in chunks of static shape: cost grows with the pixels
+that hypotheses cover. Windows overlap, so a tile's pixels also need the neighbouring tiles. So each hypothesis is
+rendered once, into an image of its own, and scored from there. The images of a batch fit into a cache; those of all
+hypotheses would fit nowhere. `over_depth` serves what the kernels do not do: free points, and backends other than CPUs
+and GPUs.
 """
 
 from collections.abc import Callable
@@ -78,8 +78,8 @@ def tiles_of_objects(
     tile: int = LARGE.tile,
 ) -> Tiles:
     """The tiles that cover the outlines of the grids of each hypothesis' K objects in the image, grown by half a
-    window; those of the whole image if `everywhere`. A box that stands askew fills little more than half of its
-    bounding rectangle: each row of tiles is as long as the outlines are wide there."""
+    window; all tiles of the image if `everywhere`. A tilted box fills little more than half of its bounding
+    rectangle, so each row of tiles is only as long as the outlines are wide there."""
     height, width = image.depth.shape
     T = T_camera_object
     extent = library.dims[type_index] * library.voxel_size[type_index][..., None]
@@ -119,8 +119,8 @@ def tiles_of_objects(
 
 
 def over_tiles(work: Callable, carry, tiles: Tiles, rows: tuple[Array | int, Array | int], each: int, size: TileSize):
-    """carry = work(carry, hypothesis, u, v, real) over chunks of the tiles of rows [begin, end), of which every
-    hypothesis has `each`. A chunk's last tiles may be none: `real` says so."""
+    """carry = work(carry, hypothesis, u, v, real) over chunks of the tiles in rows [begin, end), where every
+    hypothesis has `each` rows. The last slots of a chunk may hold no tile: `real` says which do."""
     begin, end = (tiles.first[row] for row in rows)
 
     def do_chunk(state):

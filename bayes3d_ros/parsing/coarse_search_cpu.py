@@ -34,9 +34,9 @@ def cell_scores(
     tolerance: float,
     penalty: float,
 ) -> Float[Array, "C K Y"]:
-    """Scores of surface samples of Y orientations of each type, moved to each of the first `count` places whose
-    distance is within the orientation's reach, -inf for other places and types. `worth` is what a point explained is
-    worth at 1 m; `camera` is focal length and centre. Reach is the same for each eight orientations in turn."""
+    """Scores of surface samples of Y orientations of each type, moved to each of the first `count` places within
+    the orientation's reach; -inf for other places and types. worth: the score of an explained sample at 1 m;
+    camera: focal length and centre. Reach is the same for each group of eight orientations."""
     known = jnp.clip(jnp.nan_to_num(depth, nan=0.0, posinf=_FARTHEST_M), 0.0, _FARTHEST_M)
     focal, centre = camera
     inputs = (
@@ -50,7 +50,7 @@ def cell_scores(
 
 
 class _Image(NamedTuple):
-    """What is left to explain, and the camera."""
+    """The unexplained returns, and the camera."""
 
     depth: Float[np.ndarray, "H*W"]
     unexplained: Float[np.ndarray, "H*W"]
@@ -66,7 +66,7 @@ class _Image(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Samples of a few orientations, side by side."""
+    """Surface samples of a few orientations, side by side."""
 
     pixel: Int[np.ndarray, "S"]
     z: Float[np.ndarray, "S"]
@@ -116,7 +116,7 @@ def _look_up(image, points, count):
 
 @fast
 def _weigh(image, points, count):
-    """What each point counts, for or against, in place of its area."""
+    """The score of each sample, for or against, written in place of its area."""
     zero, one = f32(0.0), f32(1.0)
     area, z, observed, unexplained, explained = (
         points.area,

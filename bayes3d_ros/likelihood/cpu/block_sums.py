@@ -16,7 +16,7 @@ from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE, SEEN_TH
 
 @strict
 def _median(residual, used, count, ordered):
-    """Of a cell's residuals; `ordered` is worked in: insertion."""
+    """Median of a cell's residuals, by insertion into `ordered`."""
     for a in range(count):
         value, b = residual[a * CELLS_SIDE_BY_SIDE + used], a
         while b > 0 and ordered[b - 1] > value:
@@ -44,7 +44,7 @@ def _labels_of_cells(scene, rectangle, stride, left, top):
 def _gather(
     picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
 ):
-    """The cell of one label in a block, as the next of the batch."""
+    """Add the cell of one label in a block to the batch."""
     u0, u1, v0, v1 = rectangle
     planes, returns_sorted = cell_work
     count, w = 0, CELLS_SIDE_BY_SIDE
@@ -90,7 +90,7 @@ def _clear(batch, returns):
 
 @strict
 def _add_cells(batch, used, label, sums, column):
-    """The batch's values, of cells of one label, to the rows of sums that they belong to."""
+    """Add the batch's log likelihoods, of cells of one label, to the rows of sums that they belong to."""
     for c in range(used):
         if batch.label[c] == label:
             sums[batch.place_of_sum[c], column] += batch.value[c]
@@ -98,7 +98,7 @@ def _add_cells(batch, used, label, sums, column):
 
 @strict
 def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
-    """The batch's cells into sums; those of the new object are kept. Returns how many these are now."""
+    """Add the batch's cells to sums; keep those of the new object. Returns how many cells are kept now."""
     sigma, p_outlier, table, scale, amplitudes = nodes
     w, tables, scales = CELLS_SIDE_BY_SIDE, len(table), len(scale)
     of_table, of_old, of_new = 0, 0, 0
@@ -134,7 +134,7 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
 
 @strict
 def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
-    """What returns that belong to no cell say, added to sums."""
+    """Add the log densities of returns that belong to no cell to sums."""
     sigma, p_outlier, table, _, amplitudes = nodes
     window, values = work
     u0, u1, v0, v1 = rectangle
@@ -164,8 +164,8 @@ def score_blocks(
     picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
     one_row,
 ):  # fmt: skip
-    """What blocks say of a scene, added to rows of sums: their own, or `one_row` the first. Returns how many cells of
-    the new object were kept."""
+    """Add the log likelihoods of blocks to rows of sums: each block to its own row, or, with `one_row`, all to the
+    first. Returns how many cells of the new object were kept."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share

@@ -18,7 +18,7 @@ u64 = np.uint64
 # Tuning of speed; what it was chosen on is in docs/speed.md.
 RAYS_SIDE_BY_SIDE = 256  # their state stays in the first-level cache; 512 and 1,024 are no faster
 WINDOWS_SIDE_BY_SIDE = 64  # pixels; a multiple of four vectors, as sums of logarithms take products of four
-VECTOR_LANES = 8  # of AVX2; loops run over multiples of it: what lies beyond the last lane is worked out and not used
+VECTOR_LANES = 8  # of AVX2; loops run over multiples of it: results beyond the last lane are not used
 # metres: no surface there. Not inf: loops are compiled for numbers that are not NaN, and inf times 0 is.
 NO_SURFACE_METRES = 1e9
 # An outline is where u + slope v and u - slope v lie between two ends each, for each of these, in a rectangle:
@@ -28,8 +28,8 @@ OUTLINE_SIDES = 4 * len(OUTLINE_SLOPES)
 
 
 class Lanes(NamedTuple):
-    """Rays in the voxels of one grid: direction, where they are, where they leave it, their pixel; the word of the
-    voxel that they are in, and the eye seen from its middle."""
+    """Rays in the voxels of one grid: direction, place, where they leave the grid, their pixel, the word of their
+    voxel, and the eye seen from the voxel's middle."""
 
     x: Float[np.ndarray, "L"]
     y: Float[np.ndarray, "L"]
@@ -44,14 +44,14 @@ class Lanes(NamedTuple):
 
 
 class Met(NamedTuple):
-    """What rays have met: its depth, negative, and their pixel."""
+    """Rays that have met a surface: its depth, negative, and their pixel."""
 
     t: Float[np.ndarray, "L"]
     pixel: Int[np.ndarray, "L"]
 
 
 class VoxelWords(NamedTuple):
-    """A voxel grid and a camera: where its words begin, how many an octant has, its size, and where the eye is, in
+    """A voxel grid and a camera: where the grid's words begin, how many an octant has, its size, and the eye in
     voxels."""
 
     first: int
@@ -66,7 +66,7 @@ class VoxelWords(NamedTuple):
 
 @strict
 def whole_vectors(count):
-    """So many lanes, and those that fill the last vector."""
+    """The number of lanes, rounded up to whole vectors."""
     return (count + VECTOR_LANES - 1) // VECTOR_LANES * VECTOR_LANES
 
 
@@ -85,8 +85,8 @@ class Things(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """The observed image and the camera's numbers, as the kernel is given them: of rows the camera's own, which are
-    the first, and of which `ray_y` tells the number."""
+    """The observed image and the camera's numbers, as the kernel is given them. Only the camera's own rows count:
+    the first ones, as many as `ray_y` has."""
 
     depth: Float[np.ndarray, "H*W"]
     pixel_class: Int[np.ndarray, "H*W"]
@@ -101,7 +101,7 @@ class Picture(NamedTuple):
 
 
 class Space(NamedTuple):
-    """What one hypothesis after the other is worked out in: a patch of the image, with half a window of border."""
+    """Working memory for one hypothesis after the other: a patch of the image, with a border of half a window."""
 
     lanes: Lanes
     met: Met
@@ -129,7 +129,7 @@ class Space(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """The windows of a few pixels, side by side: w of them, of K points each."""
+    """The windows of a few pixels, side by side: w windows of K points."""
 
     place: Int[np.ndarray, "w"]  # in the images with a border
     depth: Float[np.ndarray, "w"]
@@ -147,7 +147,7 @@ class Windows(NamedTuple):
 
 @allocating
 def _new_lanes(count):
-    """Lanes whose rays have left."""
+    """Lanes without rays."""
     one = np.ones(count, np.float32)
     nowhere = np.full(count, f32(-1.0))
     zeros, here = np.zeros(count, np.int32), np.zeros(count, np.float32)

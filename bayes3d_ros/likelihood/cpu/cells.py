@@ -30,7 +30,7 @@ LOG_HALF = f32(-np.log(2))
 
 
 class Batch(NamedTuple):
-    """Cells side by side: K returns of each of w."""
+    """w cells side by side, of K returns each."""
 
     residual: Float[np.ndarray, "K*w"]
     precision: Float[np.ndarray, "K*w"]
@@ -80,7 +80,7 @@ def new_batch(returns, pairs):
 
 @fast
 def _one_step(batch, returns, at, sigma, p):
-    """Responsibilities of inliers at the mode's place, and where their mean is."""
+    """Responsibilities of inliers at the mode's place, and the place of their mean."""
     w = u64(CELLS_SIDE_BY_SIDE)
     place, pull, weight, inliers = batch.place, batch.pull, batch.curvature, batch.inliers
     residual, precision, root, outlier = batch.residual, batch.precision, batch.root, batch.outlier
@@ -146,7 +146,8 @@ def _look(batch, returns, at, sigma, p):
 
 @strict
 def find_modes(batch, returns, sigma, p, first):
-    """Both modes of every cell, in place. Of other pairs of noise than the `first` they are near the last one's."""
+    """Both modes of every cell, in place. At pairs of noise other than the `first`, the search starts from the last
+    pair's modes."""
     w = CELLS_SIDE_BY_SIDE
     for c in range(w if first else 0):
         batch.place[c] = f32(0.0)
@@ -175,8 +176,8 @@ def _good(height, place, curvature, mean, variance):
 
 @inlined
 def _below(x):
-    """The standard normal probability below x, within .3 % of it (Börjesson and Sundberg 1979,
-    doi 10.1109/TCOM.1979.1094433)."""
+    """The standard normal probability below x, to 0.3 % (Börjesson and Sundberg 1979, doi
+    10.1109/TCOM.1979.1094433)."""
     far = min(abs(x), f32(12.5))  # farther ones have no float32
     square = far * far
     tail = exp(f32(-0.5) * square) * f32(1 / (2 * np.pi) ** 0.5)
@@ -186,8 +187,8 @@ def _below(x):
 
 @inlined
 def bad_mode(height, place, curvature):
-    """The same over an offset that is uniform in the `BAD_DEPTH` towards the camera; by the half of bad cells that are
-    so."""
+    """log of the integral of one mode over an offset that is uniform in the `BAD_DEPTH` towards the camera, as half
+    of the bad cells have it."""
     root = np.sqrt(max(curvature, f32(1e-12)))
     within = _below(-place * root) * _below((place + f32(BAD_DEPTH)) * root)
     return height + log(max(within, f32(1e-37)) / root) + _LOG_BAD_WIDTH
@@ -195,8 +196,8 @@ def bad_mode(height, place, curvature):
 
 @fast
 def normal_cells(batch, s, variance, share):
-    """log likelihood of each cell of the batch at pair of noise s, with an offset ~ N(0, variance), or, by `share`, a
-    bad one."""
+    """log likelihood of each cell of the batch at pair of noise s: with an offset ~ N(0, variance), or, with
+    probability `share`, as a bad cell."""
     w = u64(CELLS_SIDE_BY_SIDE)
     own_plane, at = batch.own_plane, u64(s) * w
     height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value

@@ -17,8 +17,8 @@ _SLOTS = 16  # of the points in a window: whole vectors
 
 @strict
 def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes, window, values):
-    """log density of the return of an edge pixel at every pair of noise, into values. window: 4 rows of numbers to
-    work in, and 3: weights of what is 0, 1 and 2 squared pixels farther away than the nearest."""
+    """log density of the return of an edge pixel at every pair of noise, written to `values`. window: 4 rows of
+    working memory, and 3 weights, of points that are 0, 1 and 2 squared pixels farther away than the nearest."""
     sigma, p_outlier, table, _, amplitudes = nodes
     row, column = k // stride, k - k // stride * stride
     x, y = picture.ray_x[column + left], picture.ray_y[row + top]
@@ -79,7 +79,7 @@ def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes,
 
 @fast
 def _mixture(weights, offs, owns, noise2):
-    """The mean of normal densities at `offs`, of variances `noise2` + `owns`, all slots side by side."""
+    """The mean of normal densities at `offs`, with variances `noise2` + `owns`, in all slots side by side."""
     total, all_weights = f32(0.0), f32(0.0)
     for c in range(u64(_SLOTS)):
         precision = f32(1.0) / (noise2 + owns[c])
@@ -91,7 +91,7 @@ def _mixture(weights, offs, owns, noise2):
 
 @allocating
 def new_window(blur):
-    """What `log_edge` works in."""
+    """Working memory of `log_edge`."""
     window = np.ones((5, _SLOTS), np.float32)
     for k in range(3):
         window[4, k] = np.exp(f32(-0.5) * f32(k) / (blur * blur)) if blur > 0 else f32(0)

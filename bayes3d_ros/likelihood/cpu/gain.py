@@ -30,8 +30,8 @@ def compiled_gain(
     noise: Noise,
     window: int,
 ) -> Float[Array, "N S P"]:
-    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
-    without scenes, nothing is there before."""
+    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma,
+    p_outlier); without scenes, the hypothesis is compared with an empty view."""
     scene_shape = (0, 0) if scenes is None else scenes.depth.shape[1:]
     shape = (len(hypotheses.type), len(noise.sigma), len(noise.p_outlier))
     numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight)
@@ -100,8 +100,9 @@ def compiled_depth(
     library: LibraryArrays,
     border: int = 0,
 ) -> Float[Array, "N Hp Wp"]:
-    """Depth of what is rendered where it is nearer than what there is to start with, inf where nothing is. Images to
-    start with have so many pixels before the camera's first row and column, and any number after the last."""
+    """Depth images with what is rendered where it is nearer than in the images to start with; inf where there is
+    nothing. Images to start with have `border` pixels before the camera's first row and column, and any number
+    after the last."""
     shape = (len(hypotheses.type), *image.depth.shape) if start is None else start.shape
     inputs = (
         *_things(hypotheses, library),
@@ -143,8 +144,8 @@ def _real(numbers: Array | np.ndarray | Sequence) -> Float[Array, "n"]:
 
 
 def _reach(image: ScoredImage, noise: Noise, window: int) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How much nearer or farther than a surface, in metres and as a share of its depth, a return may be for its
-    window's density to count beside the outliers'."""
+    """How much nearer or farther than a surface, in metres and as a share of its depth, a return may be for the
+    density of its window to count beside the outliers'."""
     least = jnp.where(image.pixel_class == IN_WORKSPACE, image.depth, jnp.inf).min()
     peak = 1 / (jnp.sqrt(2 * jnp.pi) * noise.sigma.min() * image.outlier_scale * least**2)
     odds = (1 - noise.p_outlier.min()) / jnp.maximum(noise.p_outlier.min(), 1e-12)

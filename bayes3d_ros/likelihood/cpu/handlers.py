@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hypotheses rendered and scored one after the other by loops that numba compiles, as XLA calls them on CPUs."""
+"""Loops that numba compiles, as XLA calls them on CPUs: they render and score hypotheses one after the other."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ GAIN_TARGET, DEPTH_TARGET = "bayes3d_gain_of_hypotheses", "bayes3d_depth_of_hypo
 
 @inlined
 def render_all(things, n, objects, picture, patch, stride, shift, space):
-    """The objects whose outlines have been found, into a patch that holds them."""
+    """Render the objects, whose outlines have been found, into a patch that holds them."""
     for k in range(objects):
         render_object(things, n * objects + k, k, picture, patch, stride, shift, space)
 
@@ -122,7 +122,7 @@ def _depths(things, planes, picture, start, rows, columns, border, everywhere, d
 
 @strict
 def objects_each(things, planes):
-    """How many objects a hypothesis has; every hypothesis has one plane."""
+    """How many objects each hypothesis has, where every hypothesis has one plane."""
     return len(things.type_id) // max(len(planes) // 4, 1)
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The nodes and amplitudes of `shared_errors.py` as the compiled loops are given them."""
+"""The nodes and amplitudes of `shared_errors.py`, as the compiled loops are given them."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from bayes3d_ros.likelihood.shared_errors import Amplitudes
 
 
 class NodeArrays(NamedTuple):
-    """Where the errors' parameters are summed over, and the amplitudes at the middle node."""
+    """The nodes of the error parameters, and the amplitudes at the middle node."""
 
     sigma: Float[np.ndarray, "S"]  # metres
     p_outlier: Float[np.ndarray, "S"]
@@ -24,7 +24,7 @@ class NodeArrays(NamedTuple):
 
 @strict
 def nodes_of(frame, first):
-    """From a target's arguments: this one and the four after it."""
+    """Nodes from a target's arguments: this argument and the four after it."""
     a = floats(frame, first + 4)
     amplitudes = Amplitudes(a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8])
     return NodeArrays(

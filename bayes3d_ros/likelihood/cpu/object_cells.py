@@ -27,7 +27,7 @@ class ObjectCells(NamedTuple):
     height: Float[np.ndarray, "S*2*M"]
     curvature: Float[np.ndarray, "S*2*M"]
     outliers: Float[np.ndarray, "S*M"]
-    bad: Float[np.ndarray, "S*M"]  # what the cell says where it is bad, but for outliers
+    bad: Float[np.ndarray, "S*M"]  # log likelihood as a bad cell, without the case of outliers
     column: Float[np.ndarray, "M"]
     row: Float[np.ndarray, "M"]
     number: Float[np.ndarray, "M"]  # of returns
@@ -37,8 +37,8 @@ class ObjectCells(NamedTuple):
     alike_left: Float[np.ndarray, "M"]  # correlation of the waves with those of the cell to the left, 0 where none is,
     alike_above: Float[np.ndarray, "M"]  # and with those of the one above
     alike_both: Float[np.ndarray, "M"]  # of these two with each other
-    told: Float[np.ndarray, "M"]  # worked in: 1 / variance with which a good cell tells of the waves,
-    told_place: Float[np.ndarray, "M"]  # and where it says they are, metres, with the error that the object shares
+    told: Float[np.ndarray, "M"]  # working memory: 1 / variance of the waves as a good cell shows them,
+    told_place: Float[np.ndarray, "M"]  # and their value, metres, including the object's shared error
 
 
 @allocating
@@ -81,8 +81,8 @@ def place_cells(cells, count, metres):
 
 @strict
 def find_neighbours(cells, count, block, length):
-    """Which cells are beside which, and how alike their waves are. Cells are in the order of their blocks, rows of
-    blocks from the top. block: pixels a side; length: of waves, metres."""
+    """The cells beside each cell, and the correlations of their waves. Cells are in the order of their blocks, rows
+    of blocks from the top. block: pixels a side; length: of waves, metres."""
     above = 0
     for c in range(count):
         row, column = cells.row[c] // block, cells.column[c] // block
@@ -107,7 +107,8 @@ def _alike(cells, one, other, length):
 
 @fast
 def begin_object(cells, s, most, count, share):
-    """What bad cells say, at one pair of noise, but for outliers: `cells.bad` holds what planes of their own say."""
+    """Log likelihoods of bad cells at one pair of noise, without the case of outliers. `cells.bad` holds those of
+    planes of the cells' own on entry."""
     first, at = u64(2 * s * most), u64(s * most)
     second = first + u64(most)
     for c in range(u64(count)):
@@ -121,7 +122,7 @@ def begin_object(cells, s, most, count, share):
 
 @strict
 def reference_height(cells, s, most, count):
-    """The sum of the cells' largest logs, which all sums of logs are relative to."""
+    """The sum of the largest logs of the cells; all sums of logs are relative to it."""
     total = 0.0
     for c in range(count):
         height = max(cells.height[2 * s * most + c], cells.height[2 * s * most + most + c])
@@ -131,8 +132,9 @@ def reference_height(cells, s, most, count):
 
 @fast
 def _pass(cells, s, most, count, a, variance, waves, share, sums):
-    """Sums over an object's cells given its shared error a: what the good ones tell of it, information (6) and pull
-    (3); and their logs, relative to `reference_height`, for three shares of bad ones. waves: their variance."""
+    """Sums over an object's cells given its shared error a: the information (6 numbers) and pull (3) of good cells
+    on a; and the sums of the cells' logs, relative to `reference_height`, for three shares of bad cells. waves:
+    their variance."""
     first, at = u64(2 * s * most), u64(s * most)
     second = first + u64(most)
     height, place, curvature, outliers, bad = cells.height, cells.place, cells.curvature, cells.outliers, cells.bad
@@ -147,7 +149,7 @@ def _pass(cells, s, most, count, a, variance, waves, share, sums):
     b, bx, by = f32(0.0), f32(0.0), f32(0.0)
     log_few, log_middle, log_many = f32(0.0), f32(0.0), f32(0.0)
     for c in range(u64(count)):
-        # What the waves are in this cell, as the good ones to the left and above tell.
+        # The waves in this cell, given the good cells to the left and above.
         constant, x, y, known, left_free = f32(1.0), xs[c], ys[c], f32(0.0), waves
         if waves > f32(0.0):
             alike_left, alike_above, alike_both = cells.alike_left[c], cells.alike_above[c], cells.alike_both[c]
@@ -227,7 +229,7 @@ def _log_of_shares(sums):
 
 @strict
 def _priors(scale, amplitudes):
-    """Variances of an object's bias and slopes; 0 where it has no shared error."""
+    """Variances of an object's bias and slopes; 0 if it has no shared error."""
     bias2, slope2 = (scale * amplitudes.bias) ** 2, (scale * amplitudes.lean) ** 2
     if bias2 + slope2 == 0:
         return 0.0, 0.0
@@ -243,7 +245,8 @@ def _add_priors(sums, level, slope):
 
 @strict
 def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
-    """The mode of an object's shared error at one node, by reweighted steps, into a: bias (m), slopes along x and y."""
+    """The mode of an object's shared error at one node, by reweighted steps, written to a: bias (m), slopes along x
+    and y."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
     waves = f32((scale * amplitudes.wave) ** 2)
     level, slope = _priors(scale, amplitudes)
@@ -258,8 +261,8 @@ def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
 
 @strict
 def log_object(cells, s, most, count, scale, amplitudes, sums, a):
-    """log density of the cells of one object at one node, relative to `reference_height`: its shared error integrated
-    out by a paraboloid about a, which is near the mode."""
+    """log density of the cells of one object at one node, relative to `reference_height`. Its shared error is
+    integrated out by a paraboloid about a, which is near the mode."""
     variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
     level, slope = _priors(scale, amplitudes)
     _pass(cells, s, most, count, a, variance, f32((scale * amplitudes.wave) ** 2), share, sums)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where objects are in the image: the outline of the hull of all that rays can meet of an object."""
+"""Where objects are in the image: outlines of the hulls of everything that rays can meet of an object."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _INF = np.float32(np.inf)
 
 @fast
 def _project(corners, count, pose, picture, corner_u, corner_v):
-    """Where corners are in the image. Returns the least and the largest of depth, column and row."""
+    """Project corners into the image. Returns the least and the largest depth, column and row."""
     most = u64(len(corners) // 3)
     near, far, left, right, top, bottom = _INF, -_INF, _INF, -_INF, _INF, -_INF
     for k in range(u64(count)):
@@ -53,8 +53,8 @@ def _ends(u, v, slope, count):
 
 @strict
 def _outline(pose, corners, count, picture, k, space):
-    """Finds object k's outline. Returns the first and one past the last column and row that it may cover, none where
-    it lies behind the camera; and whether some of it does."""
+    """Find object k's outline. Returns the first and one past the last column and row that it may cover, none if it
+    lies behind the camera; and whether a part of it does."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     for number in pose:
         if not abs(number) < FAR_AWAY:  # NaN too
@@ -78,7 +78,7 @@ def _outline(pose, corners, count, picture, k, space):
 
 @fast
 def cut_rows(sides, first, last, left, right):
-    """Where an outline begins and ends in each of some rows."""
+    """First and last columns of an outline in each of some rows."""
     first, last = u64(first), u64(last)
     for row in range(first, last):
         left[row], right[row] = f32(-NO_SURFACE_METRES), f32(NO_SURFACE_METRES)
@@ -93,7 +93,7 @@ def cut_rows(sides, first, last, left, right):
 
 @inlined
 def find_outlines(things, n, objects, picture, space):
-    """Finds where a hypothesis' objects are in the image. Returns the rectangle around them."""
+    """Find where a hypothesis' objects are in the image. Returns the rectangle around them."""
     u0, u1, v0, v1, corners = len(picture.ray_x), 0, len(picture.ray_y), 0, most_corners(things)
     for k in range(objects):
         thing = n * objects + k

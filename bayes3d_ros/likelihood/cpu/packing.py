@@ -36,8 +36,8 @@ def float_as_bits(context, number):
 
 
 def _pick(sign):
-    """The lesser, or the larger, of two numbers that are not NaN. Of numba's min and max LLVM makes scalars, where a
-    loop is over all of them."""
+    """The smaller or the larger of two numbers that are not NaN. LLVM makes scalar code of numba's min and max in
+    loops."""
 
     @intrinsic
     def pick(context, one, other):
@@ -55,7 +55,7 @@ lesser, larger = _pick("<"), _pick(">")
 
 
 def _eight(context, builder, array_type, array, first):
-    """Where eight numbers of an array lie, as one vector."""
+    """Eight numbers of an array as one vector."""
     data = context.make_array(array_type)(context, builder, array).data
     element = context.get_data_type(array_type.dtype)
     return builder.bitcast(builder.gep(data, [first]), ir.VectorType(element, VECTOR_LANES).as_pointer())

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The part of an image that a hypothesis changes, pixel by pixel: what each return is scored as. The kinds are those of
+"""The part of an image that a hypothesis changes, pixel by pixel: the kind of each return. Kinds are those of
 `likelihood/slow_pixel_kinds.py`."""
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ _NO_OBJECT = 1e6  # metres, to no object
 
 
 class Returns(NamedTuple):
-    """The image, as `SharedErrorImage` has it, beside `Picture`."""
+    """Arrays of `SharedErrorImage` that the loops need besides `Picture`."""
 
     bare: Float[np.ndarray, "H*W"]
     spread: Float[np.ndarray, "H*W"]
@@ -39,24 +39,24 @@ class Returns(NamedTuple):
 
 
 class ScenePixels(NamedTuple):
-    """A scene in a patch with a border: its depth, and what each pixel is."""
+    """A scene in a patch with a border: its depth, and the kind of each pixel."""
 
     depth: Float[np.ndarray, "I"]  # NO_SURFACE_METRES where there is no surface
     label: Int[np.ndarray, "I"]
     kind: Int[np.ndarray, "I"]
     near_outline: Int[np.ndarray, "I"]  # pixels about those with several surfaces
-    of_object: Int[np.ndarray, "I"]  # returns that are as far as an object in their window
+    of_object: Int[np.ndarray, "I"]  # returns at the depth of an object in their window
 
 
 class Patch(NamedTuple):
-    """The bare table and the margins in the patch, and what one scene after the other is worked out in."""
+    """The bare table and the margins in the patch, and working memory for one scene after the other."""
 
     bare: Float[np.ndarray, "I"]
     margin: Float[np.ndarray, "I"]
     several: Int[np.ndarray, "I"]
     front: Float[np.ndarray, "I"]  # the least depth of the pixel and of objects in its window
     apart: Float[np.ndarray, "I"]  # metres of depth between a return and the nearest such object
-    nowhere: Int[np.ndarray, "I"]  # no flag: nothing that a scene changes
+    nowhere: Int[np.ndarray, "I"]  # flags that are never set
     changes: Int[np.ndarray, "I"]  # pixels that are scored otherwise with the new object
     row: Int[np.ndarray, "I"]
 
@@ -126,7 +126,7 @@ def _find_several(depth, label, seen, first, last, stride, step_x, step_y, sever
 
 @fast
 def _find_kinds(space, scene, patch, front_margin, first, last):
-    """Kinds of pixels between two; whether any is `_BEHIND`."""
+    """Kinds of the pixels from one index to another; returns whether any is `_BEHIND`."""
     depth, label, kind, of_object = scene.depth, scene.label, scene.kind, scene.of_object
     several, front, apart, margins, seen = patch.several, patch.front, patch.apart, patch.margin, space.depth
     pixel_class = space.pixel_class
@@ -152,7 +152,7 @@ def _find_kinds(space, scene, patch, front_margin, first, last):
 
 @strict
 def _go_on(space, patch, scene, stride, size, border):
-    """Returns behind an object of their window: unknown where the depth of something unknown goes on."""
+    """Returns behind an object of their window become unknown where the depth of something unknown goes on to them."""
     kind, z, rows = scene.kind, space.depth, size // stride
     for v in range(border, rows - border):
         for u in range(border, stride - border):
@@ -171,7 +171,7 @@ def _go_on(space, patch, scene, stride, size, border):
 
 @strict
 def sort_scene(picture, space, patch, scene, changed, stride, size, border):
-    """What each pixel of a scene is; `changed`: where it shows the new object."""
+    """The kind of each pixel of a scene. changed: pixels that show the new object."""
     first, last = border * stride + border, size - border * stride - border
     step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
     _find_labels(scene.depth, patch.bare, changed, size, scene.label)
@@ -193,7 +193,8 @@ def sort_scene(picture, space, patch, scene, changed, stride, size, border):
 
 @fast
 def mask_nats(space, scene, first, last, stride):
-    """Prior's nats of the outlines of what is unknown, negative. The border holds no pixel of the image's workspace."""
+    """Log prior of the outlines of unknown things, in nats: negative. No pixel of the border is in the image's
+    workspace."""
     kind, of_object, depth, pixel_class = scene.kind, scene.of_object, space.depth, space.pixel_class
     sides, seams = i32(0), i32(0)
     for away in (1, stride):
@@ -210,8 +211,8 @@ def mask_nats(space, scene, first, last, stride):
 
 @fast
 def find_changes(space, now, former, first, last, changes):
-    """Pixels that are scored otherwise than before, into changes; the sum of depths and the number of the pixels that
-    show the new object alone."""
+    """Pixels that are scored otherwise than without the new object, written to `changes`; returns the sum of depths
+    and the number of the pixels that show only the new object."""
     seen, kind, before = space.seen, now.kind, former.kind
     near, near_before, label, depth = now.near_outline, former.near_outline, now.label, now.depth
     metres, pixels = f32(0.0), f32(0.0)
@@ -225,7 +226,7 @@ def find_changes(space, now, former, first, last, changes):
 
 @fast
 def gather_rows(changes, at, stride, rows, count, found):
-    """found[u]: whether there is a change in the column u of so many rows."""
+    """found[u]: whether there is a change in column u, over so many rows."""
     at, stride = u64(at), u64(stride)
     for u in range(u64(count)):
         found[u] = u8(0)

@@ -2,9 +2,9 @@
 
 """The walk of rays through voxel grids, many side by side.
 
-Rays of a hypothesis are `Lanes`: every loop over lanes is plain arithmetic, of which LLVM makes vector instructions,
-and what they look up is fetched in a loop of its own. Rays that have ended make room. The walk is that of
-`likelihood/march.py`, written again in scalars; tests compare.
+Rays of a hypothesis are `Lanes`. Every loop over lanes is plain arithmetic, of which LLVM makes vector instructions;
+lookups are in a loop of their own. Rays that have ended are replaced by new ones. The walk is that of
+`likelihood/march.py`, written again in scalars; tests compare them.
 """
 
 import numpy as np
@@ -64,8 +64,8 @@ def _enter(grid, turn, lanes, first, last):
 
 @inlined
 def _find(grid, lanes, count):
-    """The voxels that rays are in: where in the words they are, and the eye from their middles. Rays that have ended
-    are in any voxel."""
+    """The voxels that rays are in: their place among the words, and the eye from their middles. Rays that have
+    ended may have any voxel."""
     dx, dy, dz, t, word = lanes.x, lanes.y, lanes.z, lanes.t, lanes.word
     eye_x, eye_y, eye_z = lanes.eye_x, lanes.eye_y, lanes.eye_z
     x, y, z = grid.eye_x - f32(0.5), grid.eye_y - f32(0.5), grid.eye_z - f32(0.5)
@@ -119,7 +119,7 @@ def _advance(lanes, count):
 
 @inlined
 def _place_rays(ray_x, first, count, y, pixel, lanes, used):
-    """Rays of a few pixels of a row into the lanes after those in use."""
+    """Put the rays of a few pixels of a row into the lanes after those in use."""
     x, dy, place = lanes.x, lanes.y, lanes.pixel
     first, used = u64(first), u64(used)
     for k in range(u64(count)):
@@ -128,7 +128,7 @@ def _place_rays(ray_x, first, count, y, pixel, lanes, used):
 
 @inlined
 def _make_room(lanes, count, met, patch):
-    """Put down what has been met, and move the rays that go on together."""
+    """Record the rays that have met a surface, and move the rays that go on together."""
     dx, dy, dz, t, leave, pixel = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave, lanes.pixel
     kept, ended = u64(0), u64(0)
     for first in range(u64(0), u64(count), u64(VECTOR_LANES)):
@@ -153,8 +153,8 @@ def _make_room(lanes, count, met, patch):
 
 @fast
 def _walk(words, grid, lanes, count, most, met, patch):
-    """The rays in the first lanes until at most so many are left; depth goes into the patch where it is nearer than
-    what is there. Returns how many are left."""
+    """Walk the rays in the first lanes until at most so many remain. Depth goes into the patch where it is nearer
+    than what is there. Returns how many rays remain."""
     left = MOST_STEPS
     while count > most:
         for _ in range(_STEPS_BEFORE_ROOM):
@@ -177,7 +177,7 @@ def _eye(pose, origin, axis):
 
 @inlined
 def render_object(things, thing, k, picture, patch, stride, shift, space):
-    """The depth of a hypothesis' object k, where it is nearer than what is in the patch."""
+    """Render the depth of a hypothesis' object k into the patch, where it is nearer than what is there."""
     type_id, pose, turn, lanes = (
         things.type_id[thing],
         things.pose[12 * thing : 12 * thing + 12],

@@ -42,7 +42,8 @@ WARP = 3  # numbers of the shared error of an object: metres at the image's firs
 
 @strict
 def _find_touched(changes, rectangle, block, stride, left, top, across, row, touched):
-    """The blocks that hold a change, by number, into touched; how many. `row` is worked in."""
+    """The numbers of the blocks that hold a change, written to `touched`; returns how many. `row` is working
+    memory."""
     u0, u1, v0, v1 = rectangle
     count = 0
     for v in range(v0, v1, block):

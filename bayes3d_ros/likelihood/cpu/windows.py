@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The scores of pixels: which windows a hypothesis changes, and what their mixtures say.
+"""The scores of pixels: which windows a hypothesis changes, and the mixtures in these windows.
 
-The densities are those of `likelihood/density.py`, written again in scalars; tests compare.
+The densities are those of `likelihood/density.py`, written again in scalars; tests compare them.
 """
 
 import numpy as np
@@ -58,7 +58,7 @@ def log(x):
 
 @inlined
 def _copy_scene(scenes, scene_at, count, before, patch, at):
-    """A row of what is there before; inf becomes NO_SURFACE_METRES."""
+    """Copy a row of the scene; inf becomes NO_SURFACE_METRES."""
     scene_at, at = u64(scene_at), u64(at)
     for k in range(u64(count)):
         depth = min(scenes[scene_at + k], f32(NO_SURFACE_METRES))
@@ -68,7 +68,7 @@ def _copy_scene(scenes, scene_at, count, before, patch, at):
 
 @inlined
 def _copy_returns(picture, pixel, count, depth, pixel_class, at):
-    """A row of the observed image."""
+    """Copy a row of the observed image."""
     every_depth, every_class = picture.depth, picture.pixel_class
     pixel, at = u64(pixel), u64(at)
     for k in range(u64(count)):
@@ -78,7 +78,7 @@ def _copy_returns(picture, pixel, count, depth, pixel_class, at):
 
 @fast
 def mark_changes(patch, before, size, changed):
-    """Where the hypothesis changes the patch; the least and the largest depth there."""
+    """Mark the pixels that the hypothesis changes; returns the least and the largest depth there."""
     low, high = f32(NO_SURFACE_METRES), f32(0.0)
     for k in range(u64(size)):
         new, depth = patch[k] < before[k], patch[k]
@@ -90,8 +90,8 @@ def mark_changes(patch, before, size, changed):
 
 @strict
 def windows_with(flags, size, stride, border, wider, seen):
-    """Pixels in whose windows there is a flag: along rows, then along columns. The border has neither flags nor pixels,
-    so that it does not matter where a row ends."""
+    """Pixels whose windows hold a flag: along rows, then along columns. The border has neither flags nor pixels, so
+    the ends of rows need no care."""
     first, last = border * stride + border, size - border * stride - border
     _either(flags, border, size - border, 1, border, wider)
     _either(wider, first, last, stride, border, seen)
@@ -122,8 +122,9 @@ def _either(flags, first, last, step, border, found):
 
 @fast
 def sort_pixels(space, first, last, low, high, front_margin):
-    """Pixels that the hypothesis changes: how many have windows to be looked at (`close`), how many are too far from
-    every surface for anything but an outlier, and how many it stands in front of that saw beyond."""
+    """Sort the pixels that the hypothesis changes: those whose windows must be computed (`close`), the number of
+    those too far from every surface for anything but an outlier, and the number of those whose return lies beyond
+    the workspace, behind the hypothesis."""
     depth, pixel_class, seen, patch, before, close = (
         space.depth,
         space.pixel_class,
@@ -147,7 +148,7 @@ def sort_pixels(space, first, last, low, high, front_margin):
 
 @fast
 def begin_ends(patch, size, low, high):
-    """Depth of surfaces, as the least and the largest."""
+    """Depth of surfaces, as the start of the least and the largest of a window."""
     for k in range(u64(size)):
         depth = patch[k]
         low[k], high[k] = depth, depth if depth < f32(NO_SURFACE_METRES) else f32(0.0)
@@ -178,8 +179,8 @@ def widen_ends(low, high, first, last, step, border, least, most):
 
 @fast
 def sort_pixels_again(space, first, last, metres, share):
-    """Of the pixels whose windows were to be looked at, those that are not too far from every surface of their own
-    window; how many the others are."""
+    """Keep the pixels in `close` that are not too far from every surface of their own window; returns how many were
+    not kept."""
     depth, close, low, high, left_out = space.depth, space.close, space.low, space.high, i32(0)
     for k in range(u64(first), u64(last)):
         z = depth[k]
@@ -193,7 +194,7 @@ def sort_pixels_again(space, first, last, metres, share):
 
 @fast
 def list_places(close, first, last, listed):
-    """The places of pixels whose windows are to be looked at."""
+    """The places of pixels whose windows must be computed."""
     used = u64(0)
     for k in range(u64(first), u64(last)):
         listed[used] = i32(k)
@@ -203,7 +204,8 @@ def list_places(close, first, last, listed):
 
 @strict
 def begin_windows(picture, space, first, count, stride, left, top, windows):
-    """The windows of some listed pixels; beyond the last, its own again. (left, top) is the pixel at place 0."""
+    """Windows of some listed pixels; slots beyond the last pixel repeat the last one. (left, top) is the pixel at
+    place 0."""
     for k in range(whole_vectors(count)):
         place = space.listed[first + min(k, count - 1)]
         row = place // stride
@@ -242,7 +244,7 @@ def _measure(windows, to, ex, ey, full):
 
 @inlined
 def _weigh(windows, to, scale, full):
-    """A point of every window into the mixtures."""
+    """Add a point of every window to the mixtures."""
     across, along, nearest, both, weight = (
         windows.across,
         windows.along,
@@ -260,7 +262,8 @@ def _weigh(windows, to, scale, full):
 
 @inlined
 def _odds(windows, norm, count, odds, to):
-    """Inliers' densities over outliers': of the mixture, 1 where a window holds no surface, and beyond the last."""
+    """Densities of inliers over those of outliers, from the mixtures; 1 for windows without a surface, and for
+    slots beyond the last."""
     outlier, norm2, nearest, both, weight = (
         windows.outlier,
         windows.norm2,
@@ -309,7 +312,7 @@ def sum_of_logs(p, odds, at):
 
 @strict
 def begin_patch(picture, scenes, scene_at, scene_stride, rectangle, border, space):
-    """What is there before, and what was observed, in a patch around a rectangle. Returns the patch' stride and size,
+    """Copy the scene and the observed image around a rectangle into a patch. Returns the patch' stride and size,
     and its first column and row in the image, which may lie outside by half a window."""
     u0, u1, v0, v1 = rectangle
     width, height = len(picture.ray_x), len(picture.ray_y)

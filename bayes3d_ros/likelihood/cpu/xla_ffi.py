@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""XLA's foreign functions written in numba: what a compiled function finds in the call frame that XLA hands it.
+"""Foreign functions of XLA written in numba: reading the call frame that XLA hands over.
 
-The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()): structs are looked at as
-arrays of 64-bit words. Whoever calls these functions has asked `call_frame.readable` before.
+The layout is that of XLA's stable C interface, `xla/ffi/api/c_api.h` (jax.ffi.include_dir()): structs are read as
+arrays of 64-bit words. Callers have checked `call_frame.readable` before.
 """
 
 import ctypes

@@ -92,9 +92,9 @@ def triton_gain(
     window: int,
     interpret: bool | None = None,
 ) -> Float[Array, "N S P"]:
-    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma, p_outlier);
-    without scenes, nothing is there before. Where there is no GPU it is interpreted, slowly, unless `interpret` says
-    otherwise."""
+    """log p(image | scene and what is rendered) - log p(image | scene) of each hypothesis for every (sigma,
+    p_outlier); without scenes, the hypothesis is compared with an empty view. Without a GPU the kernel is
+    interpreted, slowly, unless `interpret` says otherwise."""
     interpret = jax.default_backend() != "gpu" if interpret is None else interpret
     count, objects = hypotheses.type.shape
     height, width = image.depth.shape
