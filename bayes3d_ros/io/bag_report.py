@@ -103,7 +103,8 @@ def _frame_facts(reader: FrameReader, contents: BagContents) -> tuple[tuple[tupl
         missing.append(f"{reader.depth_topic}: none of its {len(reader)} images can be read{_reason(reader)}")
     poses = reader.camera_poses()
     count = sum(pose is not None for pose in poses)
-    facts.append(("poses", f"{reader.pose_told}: {count} of {len(poses)} images have one"))
+    if count:
+        facts.append(("poses", f"{reader.pose_told}: {count} of {len(poses)} images have one"))
     if not count:
         why = (
             reader.pose_told

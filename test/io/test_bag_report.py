@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fixtures.bag_messages import START, image, info, transforms, write
 
 from bayes3d_ros.io.bag_report import TOPIC_COLUMNS, bag_report
 from bayes3d_ros.io.bags import BagError, BagWriter, read_frames
@@ -91,3 +92,23 @@ def test_poses_and_frames_are_read_without_the_rest(bag_of):
     assert [pose is not None for pose in poses] == [frame.T_table_camera is not None for frame in reader]
     assert [frame.stamp_ns for frame in reader.spread(2)] == [10**9, 13 * 10**8]
     assert len(reader.spread(9)) == 4
+
+
+def test_a_table_that_tf_does_not_know_is_told_with_the_frames_that_it_knows(tmp_path):
+    tf = ("/tf_static", transforms(("base_link", "camera", 2.0, 1.0)))
+    recorded = (("/cam/camera_info", info()), ("/cam/image_rect", image(START)), tf)
+    bag = write(tmp_path / "bag", *recorded)
+    report = bag_report(bag)
+    (words,) = report.missing
+    assert "(--table-frame); the bag has the frames base_link, camera; bayes3d parse finds the table" in words
+    assert "poses" not in dict(report.facts)
+    assert [row[4] for row in report.topics if row[0] == "/tf_static"] == ["base_link -> camera"]
+    known = bag_report(bag, None, "base_link")
+    assert known.missing == () and known.command.endswith("--table-frame base_link")
+
+
+def test_several_depth_topics_ask_for_a_choice(tmp_path):
+    topics = [("/a/depth", image(START)), ("/b/depth", image(START)), ("/a/camera_info", info())]
+    report = bag_report(write(tmp_path / "bag", *topics))
+    assert report.missing == ("expected one depth image topic, choose with --topic: /a/depth, /b/depth",)
+    assert report.command == ""
