@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bayes3d_ros.io.plots import colour
+from bayes3d_ros.io.palette import colour
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
