@@ -51,6 +51,7 @@ class LibraryArrays(NamedTuple):
     solid: Float[Array, "K Q 3"]  # points inside the solid, object frame
     alike_face: Int[Array, "K 6 A"]  # placements that look like each other (`self_symmetry.py`)
     alike_shift: Float[Array, "K 6 A 3"]  # along the contact's own x and y, and yaw
+    turned_shift: Float[Array, "K 6 T 3"]  # the same of turns that leave most of the surface in its place
 
 
 def contact_transform(model: ObjectModel, face: int) -> Float[np.ndarray, "4 4"]:
@@ -145,6 +146,7 @@ def library_arrays(library: Library) -> LibraryArrays:
         solid=stack([p[_spread(p, SOLID_POINTS)] for p in map(_inside, models)]),
         alike_face=stack([a.face for a in alike], np.int32),
         alike_shift=stack([a.shift for a in alike]),
+        turned_shift=stack([a.turned for a in alike]),
     )
 
 

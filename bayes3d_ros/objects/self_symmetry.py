@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from bayes3d_ros.geometry.poses import slide
 
 ALIKE = 7  # kept for every face
+TURNED = 30  # turns in yaw, a full circle: a handle of a mug is wider than half a step
 _TURNS = 60  # in yaw, that are compared first
 _COMPARED_POINTS = 64  # of the surface
 _YAW_HALVINGS = 5  # of the step in yaw
@@ -32,6 +33,9 @@ class SelfSymmetry(NamedTuple):
 
     face: Int[np.ndarray, "6 A"]
     shift: Float[np.ndarray, "6 A 3"]
+    # For each contact face, turns by k / TURNED of a circle, with the (x, y) that keeps the surface in its place as far
+    # as it can be: of a mug, the body stays and the handle moves.
+    turned: Float[np.ndarray, "6 T 3"]
 
 
 class _Surface(NamedTuple):
@@ -52,7 +56,7 @@ def self_symmetry(
     extent = np.array([np.ptp(w[:, 2]) for w in whole])
     middle = np.array([0.5 * (w.max(0) + w.min(0))[:2] for w in whole])
     faces = len(T_contact_object)
-    found = SelfSymmetry(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    found = _nothing_alike(faces)
     turn = np.arange(_TURNS) * 2 * np.pi / _TURNS
     c, s = np.cos(turn), np.sin(turn)
     best: list[list[tuple[float, int, np.ndarray]]] = [[] for _ in range(faces)]
@@ -62,6 +66,8 @@ def self_symmetry(
             turned = np.stack([c * x - s * y, s * x + c * y], 1)
             shift = np.concatenate([middle[face] - turned, turn[:, None]], 1)
             shift, error = _slid(shift, resting[other], T, surface)
+            if other == face:
+                found.turned[face] = _kept_in_place(shift[:: _TURNS // TURNED], resting[face], T, surface)
             lowest = (error <= np.roll(error, 1)) & (error <= np.roll(error, -1)) & (error < 2 * _ALIKE_WITHIN)
             shift, error = shift[lowest], error[lowest]
             for halving in range(_YAW_HALVINGS if len(shift) else 0):
@@ -90,11 +96,28 @@ def self_symmetry(
     return _reversible(found)
 
 
+def _nothing_alike(faces: int) -> SelfSymmetry:
+    alike = np.tile(np.arange(faces)[:, None], (1, ALIKE))
+    return SelfSymmetry(alike, np.zeros((faces, ALIKE, 3)), np.zeros((faces, TURNED, 3)))
+
+
+def _kept_in_place(
+    shift: Float[np.ndarray, "T 3"],
+    points: Float[np.ndarray, "P 3"],
+    T_contact_object: Float[np.ndarray, "4 4"],
+    surface: _Surface,
+) -> Float[np.ndarray, "T 3"]:
+    """Turns, slid along the table to where the surface lies on itself best."""
+    for _ in range(_SLIDES):
+        shift, _ = _slid(shift, points, T_contact_object, surface)
+    return shift
+
+
 def _reversible(found: SelfSymmetry) -> SelfSymmetry:
     """Only ways that lead back exactly: of (a to b, b to a) one is made the other's inverse, a lone one gets an inverse
     where there is room and is dropped where there is none. A sampler may then jump along them."""
     faces = len(found.face)
-    paired = SelfSymmetry(np.tile(np.arange(faces)[:, None], (1, ALIKE)), np.zeros((faces, ALIKE, 3)))
+    paired = _nothing_alike(faces)._replace(turned=found.turned)
     room = [ALIKE] * faces
 
     def add(face: int, other: int, shift: Float[np.ndarray, "3"]) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, log_prior, shifted
-from bayes3d_ros.objects.self_symmetry import ALIKE
+from bayes3d_ros.objects.self_symmetry import ALIKE, TURNED
 from bayes3d_ros.parsing.proposal import Modes, draw_modes, log_density_modes, refit
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction
@@ -58,6 +58,15 @@ def _bounded(scale: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
     scale = jnp.where(jnp.eye(3, dtype=bool), jnp.maximum(scale, jnp.array(SEARCH.smallest_spread)), scale)
     excess = (jnp.linalg.norm(scale, axis=2) / jnp.array(SEARCH.largest_spread)).max(1)
     return scale / jnp.maximum(excess, 1)[:, None, None]
+
+
+def turned(modes: Hypotheses, library: LibraryArrays) -> Hypotheses:
+    """Copies of N modes at TURNED turns each, [N * TURNED], that leave most of the object's surface in its place. Where
+    only a small part tells one yaw from another (the handle of a mug), a search by surface samples can miss the yaw."""
+    at = jax.tree.map(lambda a: jnp.repeat(a, TURNED), modes.placement)
+    shift = library.turned_shift[modes.placement.type, modes.placement.face].reshape(-1, 3)
+    copies = shifted(at, at.face, shift)
+    return Hypotheses(copies._replace(yaw=jnp.mod(copies.yaw, 2 * jnp.pi)), jnp.repeat(modes.scale, TURNED, 0))
 
 
 def widened(modes: Hypotheses) -> Hypotheses:

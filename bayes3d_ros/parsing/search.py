@@ -21,6 +21,7 @@ from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
 from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_into_region, overlap
+from bayes3d_ros.objects.self_symmetry import TURNED
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
     UnexplainedReturns,
@@ -41,6 +42,7 @@ from bayes3d_ros.parsing.mode_search import (
     narrow,
     sharpen,
     take,
+    turned,
     widened,
     with_self_symmetry,
 )
@@ -262,6 +264,24 @@ def _types_first(
     return best_first(modes, value + jnp.where(first, _CROWDED_OUT_NATS, 0.0), others + each * types)[0]
 
 
+def _with_turns(
+    modes: Hypotheses, value: Float[Array, "N"], gains: Gains, library: LibraryArrays
+) -> tuple[Hypotheses, Float[Array, "N2"]]:
+    """These hypotheses, and of the best one of each of `turned_types` types those of its turns that gain most. Both are
+    sorted by falling gain."""
+    types = min(SEARCH.turned_types, len(value))
+    first = _best_of_types(modes.placement.type, value, 1, types)
+    source, _ = best_first(modes, jnp.where(first, value, -jnp.inf), types)
+    copies = turned(source, library)
+    gained = gains(copies.placement).reshape(types, TURNED)
+    peak = (gained >= jnp.roll(gained, 1, 1)) & (gained >= jnp.roll(gained, -1, 1))
+    best, turn = jax.lax.top_k(jnp.where(peak, gained, -jnp.inf), SEARCH.turns_kept)
+    index = (turn + TURNED * jnp.arange(types)[:, None]).ravel()
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b[index]]), modes, copies)
+    value = jnp.concatenate([value, best.ravel()])
+    return best_first(both, value, len(value))
+
+
 def _searched(
     key: PRNGKeyArray,
     found: Hypotheses,
@@ -278,6 +298,7 @@ def _searched(
     # little before most are dropped.
     modes, value = narrow(early_key, found, rough, SEARCH.early_draws, SEARCH.early_rounds)
     modes, value = best_first(modes, value, len(value))
+    modes, value = _with_turns(modes, value, rough, library)
     modes = _types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
     if isinstance(model, NoiseGrid):
         modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)

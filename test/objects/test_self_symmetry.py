@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.objects.library_arrays import NUM_FACES, contact_transform
 from bayes3d_ros.objects.mesh_import import model_from_mesh
-from bayes3d_ros.objects.self_symmetry import self_symmetry
+from bayes3d_ros.objects.self_symmetry import TURNED, self_symmetry
 
 
 def of(mesh):
@@ -99,3 +99,22 @@ def test_a_mug_without_a_bottom_is_its_mirror_image_upside_down():
 
         off = handle_at(other) + yaw - handle_at(face)
         assert abs(np.degrees((off + np.pi) % (2 * np.pi) - np.pi)) < 2
+
+
+def test_turns_leave_the_body_of_a_mug_in_its_place():
+    """Of a can with a handle the box's middle is not the can's axis: at every turn the can lies on itself."""
+    can = trimesh.creation.cylinder(0.04, 0.1, sections=64)
+    handle = trimesh.creation.box((0.03, 0.012, 0.05)).apply_translation((0.05, 0.0, 0.0))
+    model, T, found = of(trimesh.util.concatenate([can, handle]))
+    points, tree = model.surface_points, cKDTree(model.surface_points)
+    standing = [face for face in range(NUM_FACES) if abs(T[face][2, 2]) > 0.9]
+    assert len(standing) == 2
+    for face in standing:
+        assert np.allclose(found.turned[face][0], 0.0, atol=5e-4)
+        for k, (x, y, yaw) in enumerate(found.turned[face]):
+            assert yaw == pytest.approx(2 * np.pi * k / TURNED)
+            c, s = np.cos(yaw), np.sin(yaw)
+            at = (points @ T[face][:3, :3].T + T[face][:3, 3]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+            local = (at + [x, y, 0] - T[face][:3, 3]) @ T[face][:3, :3]
+            body = np.hypot(*points[:, :2].T) < 0.042
+            assert np.quantile(tree.query(local[body])[0], 0.95) < 0.006

@@ -5,9 +5,15 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 
+from bayes3d_ros.objects.library_arrays import NUM_FACES, library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
+from bayes3d_ros.objects.self_symmetry import TURNED
 from bayes3d_ros.parsing.mode_search import Hypotheses, factor, log_shares, sharpen
+from bayes3d_ros.parsing.search import _with_turns
 
 
 def test_a_type_of_a_few_percent_is_drawn_however_many_modes_the_other_has():
@@ -36,6 +42,41 @@ def test_factors_of_covariances_that_rounding_made_indefinite():
     scale = np.asarray(factor(covariance), np.float64)
     assert np.isfinite(scale).all() and (np.triu(scale, 1) == 0).all()
     np.testing.assert_allclose(scale @ scale.swapaxes(1, 2), covariance, rtol=2e-5, atol=1e-11)
+
+
+def test_the_turn_at_which_a_handle_fits_is_found_from_any_other():
+    """Of a can with a handle, gains that fall with the body's distance from its place and the handle's from its yaw."""
+    can = trimesh.creation.cylinder(0.04, 0.1, sections=64)
+    handle = trimesh.creation.box((0.03, 0.012, 0.05)).apply_translation((0.05, 0.0, 0.0))
+    brick = trimesh.creation.box((0.05, 0.06, 0.07))
+    meshes = {"mug": trimesh.util.concatenate([can, handle]), "brick": brick}
+    models = tuple(model_from_mesh(mesh, name, 0.004) for name, mesh in meshes.items())
+    library = library_arrays(Library(models))
+    face = next(f for f in range(NUM_FACES) if library.T_contact_object[0, f, 2, 2] > 0.9)
+    axis = np.asarray(library.T_contact_object[0, face, :2, 3])  # of the can, from the middle of the mug's box
+    place, right = np.array([0.1, -0.05]), 1.234
+
+    def gains(at):
+        c, s = jnp.cos(at.yaw), jnp.sin(at.yaw)
+        body = jnp.stack([at.x + c * axis[0] - s * axis[1], at.y + s * axis[0] + c * axis[1]], -1) - place
+        handle_off = jnp.abs((at.yaw - right + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+        value = -((jnp.linalg.norm(body, axis=-1) / 0.004) ** 2) - jnp.minimum(handle_off / 0.1, 5.0) ** 2
+        return jnp.where(at.type == 0, value, -1e3)
+
+    def beside(yaw):
+        c, s = np.cos(yaw), np.sin(yaw)
+        return place - np.array([c * axis[0] - s * axis[1], s * axis[0] + c * axis[1]])
+
+    wrong = right + 2.5
+    x, y = (jnp.array([a, 0.0]) for a in beside(wrong))
+    start = Placement(jnp.array([0, 1]), jnp.array([face, 0]), x, y, jnp.array([wrong, 0.0]))
+    value = gains(start)
+    modes, found = _with_turns(Hypotheses(start, jnp.tile(0.01 * jnp.eye(3), (2, 1, 1))), value, gains, library)
+    assert (np.diff(found) <= 0).all() and found[0] > value[0] + 20
+    off = (float(modes.placement.yaw[0]) - right + np.pi) % (2 * np.pi) - np.pi
+    assert abs(off) <= np.pi / TURNED + 1e-3
+    np.testing.assert_allclose([modes.placement.x[0], modes.placement.y[0]], beside(right + off), atol=1.5e-3)
+    np.testing.assert_allclose(gains(modes.placement), found, atol=1e-3)
 
 
 def test_sharpening_finds_a_peak_and_its_shape():
