@@ -9,12 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from bayes3d_ros.io.plots import INK, colour
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame, save_both
 
 PARSER = "Bayes3D"
+LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
 _KIB = 1024
 
 
@@ -41,7 +43,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, str | None]) -> None:
-    """Means over images; nats that a uniform density has are dotted. The scale is logarithmic above ten nats."""
+    """Means over images; nats that a uniform density has are dotted."""
     von_mises, samples, best = keys
     methods = list(dict.fromkeys(row["method"] for row in rows))
     others = [method for method in methods if method != PARSER]
@@ -53,9 +55,20 @@ def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, 
     if best is not None:
         axis.axhline(float(np.mean(rows[0][best])), color=GREY, linewidth=1, label="best von Mises there is")
     axis.set_xscale("log")
-    axis.set_yscale("symlog", linthresh=10)
+    _nats(axis)
     axis.tick_params(labelsize=8)
     open_frame(axis)
+
+
+def _nats(axis: Axes) -> None:
+    """An axis of all that is drawn, logarithmic above LINEAR_UP_TO."""
+    values = np.concatenate([np.ravel(line.get_ydata()) for line in axis.get_lines()])
+    low, high = float(values.min()) - 0.5, float(values.max())
+    axis.set_yscale("symlog", linthresh=LINEAR_UP_TO, linscale=2.0)
+    axis.set_yticks([tick for tick in TICKS if low <= tick <= 1.3 * high])
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylim(low, high + 0.5 if high < LINEAR_UP_TO else 1.3 * high)
 
 
 def _line(axis: Axes, rows: Sequence[Row], method: str, key: str, sign: float, **style: object) -> None:
