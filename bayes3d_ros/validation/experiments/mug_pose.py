@@ -63,7 +63,9 @@ NETWORKS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "1 M": ((16, 32, 64, 128), (512, 256)),
     "7 M": ((16, 32, 64, 128), (2048, 1800)),
 }
-SETTINGS = ParserSettings(fixed_objects=1, max_objects=1, unknown=False, particles=1000, score_width=MUG_CAMERA.width)
+SETTINGS = ParserSettings(
+    fixed_objects=1, max_objects=1, unknown=False, particles=1000, score_width=MUG_CAMERA.width, sigma_max=0.01
+)
 LEARNED = LearnerSettings(voxel_size=0.005)
 PARSER = "Bayes3D"
 HEADER = f"{'method':<13} {'training':>8} {'test':<10} {'images':>6} {'cross-entropy':>13} {'log p(true)':>11} {'s':>7}"

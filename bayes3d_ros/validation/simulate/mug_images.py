@@ -42,11 +42,11 @@ class MugCondition(NamedTuple):
         return self.distance[0] == self.distance[1] and self.pitch[0] == self.pitch[1] and self.moved == 0
 
 
-TRAINED = MugCondition((0.45, 0.45), (20.0, 20.0), 0.0, IndependentNoise(0.004, 0.03))
+TRAINED = MugCondition((0.45, 0.45), (20.0, 20.0), 0.0, IndependentNoise(0.003, 0.005))
 MUG_CONDITIONS = {
     "as trained": TRAINED,
     "camera": TRAINED._replace(distance=(0.5, 0.6), pitch=(28.0, 40.0)),
-    "noise": TRAINED._replace(noise=IndependentNoise(0.008, 0.1)),
+    "noise": TRAINED._replace(noise=IndependentNoise(0.006, 0.02)),
     "moved": TRAINED._replace(moved=0.04),
 }
 

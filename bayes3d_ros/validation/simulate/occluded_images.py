@@ -22,7 +22,7 @@ from bayes3d_ros.validation.simulate.small_images import IndependentNoise, clean
 
 OCCLUDER, HIDDEN = "003_cracker_box", ("048_hammer", "dumbbell")
 OCCLUDED_CAMERA = Intrinsics(132.0, 132.0, 47.5, 35.5, 96, 72)
-OCCLUDED_NOISE = IndependentNoise(0.003, 0.02)
+OCCLUDED_NOISE = IndependentNoise(0.003, 0.005)
 _LOOKS_AT, _DISTANCE, _PITCH = (0.0, 0.08, 0.06), 0.9, np.radians(25.0)  # of the camera: metres, metres, downwards
 _X, _Y, _TURN = (-0.22, 0.22), (0.24, 0.36), np.radians(35.0)  # metres; radians that its length is off the view's
 _GAP = 0.005  # metres between the occluder and what stands behind it, at least
