@@ -46,4 +46,6 @@ def binary_scores(p: Float[np.ndarray, "N"], truth: Int[np.ndarray, "N"]) -> Bin
     p_true = np.clip(np.where(truth == 1, p, 1 - p), LEAST_PROBABILITY, 1.0)
     bins = reliability_bins(p, truth)
     error = float(np.average(np.abs(bins.said - bins.happened), weights=bins.answers))
-    return BinaryScores(float(right.mean()), float(-np.log(p_true).mean()), error if len(bins.answers) > 1 else None)
+    return BinaryScores(
+        float(right.mean()), float(0.0 - np.log(p_true).mean()), error if len(bins.answers) > 1 else None
+    )
