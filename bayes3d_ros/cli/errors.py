@@ -79,6 +79,16 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from bayes3d_ros.learning.learn import LearningError
     from bayes3d_ros.objects.model import LibraryError
     from bayes3d_ros.tracking.camera_estimate import WorldError
+    from bayes3d_ros.validation.networks.installed import NetworksMissingError
     from bayes3d_ros.validation.simulate.scene_file import SimulationError
 
-    return BagError, LearningError, LibraryError, MeshError, ResultsError, SimulationError, WorldError
+    return (
+        BagError,
+        LearningError,
+        LibraryError,
+        MeshError,
+        NetworksMissingError,
+        ResultsError,
+        SimulationError,
+        WorldError,
+    )

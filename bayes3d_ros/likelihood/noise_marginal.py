@@ -27,6 +27,7 @@ _NEAR = 5  # coarse sigmas that a search looks at
 _P_LOW, _P_HIGH = 2e-4, 0.9
 _PARTS = 5  # of a fine step, in which noise is sampled
 _DENSE = 4  # sigmas of a reference scene in a coarse step
+_CLAMPED_WITHIN = 1e-3  # of log sigma and logit p_outlier, about values that are known
 
 
 class NoiseGrid(NamedTuple):
@@ -94,6 +95,27 @@ def noise_grid(sigma_max: float, fine: tuple[int, int] = (_SIGMA_FINE, _P_FINE))
     """
     u = np.log(sigma_max) - np.log(2) / 3 * np.arange(_SIGMA_STEPS)[::-1]
     v = np.linspace(_logit(_P_LOW), _logit(_P_HIGH), _P_STEPS)
+    return _grid_over(u, v, sigma_max, fine)
+
+
+def clamped_grid(sigma: float, p_outlier: float) -> NoiseGrid:
+    """A grid of the sizes of `noise_grid` for noise that is known: sigma in metres and p_outlier, each to within 0.1 %
+    (of p_outlier its odds), with all of the prior's mass. What was compiled for the one serves the other.
+
+    Raises ValueError where sigma is not positive or p_outlier does not lie between 0 and 1.
+    """
+    if not (0 < sigma < np.inf and 0 < p_outlier < 1):
+        raise ValueError(f"expected sigma > 0 m and p_outlier between 0 and 1, got {sigma} m and {p_outlier}")
+    u = np.log(sigma) + np.linspace(-_CLAMPED_WITHIN, _CLAMPED_WITHIN, _SIGMA_STEPS)
+    v = _logit(p_outlier) + np.linspace(-_CLAMPED_WITHIN, _CLAMPED_WITHIN, _P_STEPS)
+    grid = _grid_over(u, v, sigma, (_SIGMA_FINE, _P_FINE))
+    return grid._replace(log_mass=grid.log_mass - jax.nn.logsumexp(grid.log_mass))
+
+
+def _grid_over(
+    u: Float[np.ndarray, "S"], v: Float[np.ndarray, "P"], sigma_max: float, fine: tuple[int, int]
+) -> NoiseGrid:
+    """Of evenly spaced coarse points, u = log sigma and v = logit p_outlier, with the mass of the uniform priors."""
     u_fine = np.linspace(u[0], u[-1], (len(u) - 1) * fine[0] + 1)
     v_fine = np.linspace(v[0], v[-1], (len(v) - 1) * fine[1] + 1)
     p_fine = 1 / (1 + np.exp(-v_fine))

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""How well the yaw of a mug is known (Bayes3D, "6D Pose Uncertainty"): the parser with a mug that it learned from 1 to
+10 views, against convolutional networks trained on 10 to 10,000 images, which output a von Mises distribution.
+
+Loss: cross-entropy from the exact posterior (`exact_yaw.py`: enumeration with the true mesh, the camera, the mug's
+place and the stated noise). Images are those of `mug_images.py`; both methods are given the same pixels, and the parser
+the camera's pose. A von Mises is fitted to its 1,000 samples by maximum likelihood; beside that stands the loss of the
+samples themselves, through a narrow kernel.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.learning.learn import learn
+from bayes3d_ros.objects.library_arrays import library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library, ObjectModel
+from bayes3d_ros.objects.store import load_library, save_model
+from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.types import ParseError
+from bayes3d_ros.settings import LearnerSettings, ParserSettings
+from bayes3d_ros.validation.experiments import Row, Step
+from bayes3d_ros.validation.experiments.mug_pose_plot import plot
+from bayes3d_ros.validation.networks import von_mises
+from bayes3d_ros.validation.networks.depth_input import DepthScale
+from bayes3d_ros.validation.networks.installed import require_networks
+from bayes3d_ros.validation.reference.exact_yaw import YAWS, entropy, every_yaw, yaw_axis, yaw_posterior
+from bayes3d_ros.validation.simulate.capture_views import capture
+from bayes3d_ros.validation.simulate.mug_images import (
+    MUG_CAMERA,
+    MUG_CONDITIONS,
+    TRAINED,
+    MugImages,
+    UprightMug,
+    mug_images,
+    mug_view,
+    upright_mug,
+)
+from bayes3d_ros.validation.statistics.yaw_samples import YawScores, kernel_density, weighted_yaws, yaw_scores
+
+__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+
+TRAINING, QUICK_TRAINING = (10, 30, 100, 300, 1000, 3000, 10_000), (10, 100)
+VIEWS, QUICK_VIEWS = (1, 2, 3, 5, 8, 10), (5,)
+TRUE_MESH = 0  # views of the model that is made from the mesh itself
+GROUPS, QUICK_GROUPS = 10, 1  # of test images a condition: a group has one camera and place
+GROUP, QUICK_GROUP = 10, 1  # images of a group
+TRAINING_SEED, TEST_SEED = 11, 12
+QUICK_STEPS = 60
+QUICK_YAWS = 180  # of the exact posterior
+SCALE = DepthScale(0.5, 0.1)
+# Channels of convolutions and widths of hidden layers, by the number of parameters.
+NETWORKS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+    "0.1 M": ((8, 16, 32, 64), (128,)),
+    "1 M": ((16, 32, 64, 128), (512, 256)),
+    "7 M": ((16, 32, 64, 128), (2048, 1800)),
+}
+SETTINGS = ParserSettings(
+    fixed_objects=1, max_objects=1, unknown=False, particles=1000, score_width=MUG_CAMERA.width, sigma_max=0.01
+)
+LEARNED = LearnerSettings(voxel_size=0.005)
+PARSER = "Bayes3D"
+HEADER = f"{'method':<13} {'training':>8} {'test':<10} {'images':>6} {'cross-entropy':>13} {'log p(true)':>11} {'s':>7}"
+
+
+class Truth(NamedTuple):
+    """Test images of one camera and place, and the exact posterior of each over `yaw_axis()`."""
+
+    images: MugImages
+    posterior: Float[np.ndarray, "N K"]
+
+
+class KnownMug(NamedTuple):
+    """A parser of one mug, and the yaw of the true mesh in its model's frame."""
+
+    parser: SceneParser
+    turn: float  # radians
+    seconds: float  # of learning
+    file_bytes: int
+
+
+def notes(quick: bool) -> list[str]:
+    """What the figures are of. Raises NetworksMissingError where networks cannot be trained."""
+    require_networks()
+    return [
+        "the exact posterior is given the true camera, place and noise, in steps of half a degree; where the mug is "
+        "moved neither method knows its place, so there the exact posterior is sharper than that of the images alone",
+        "networks get depth, scaled, and a channel that is 1 where nothing returned; the parser gets the camera's pose",
+        "views are of 640 x 480 pixels with a D435's noise; training images are those that are tested with",
+    ]
+
+
+def sizes(quick: bool) -> tuple[list[str], tuple[int, ...], tuple[int, ...], int]:
+    """Networks, numbers of training images, numbers of views, groups of test images."""
+    if quick:
+        return list(NETWORKS)[:1], QUICK_TRAINING, QUICK_VIEWS, QUICK_GROUPS
+    return list(NETWORKS), TRAINING, (*VIEWS, TRUE_MESH), GROUPS
+
+
+def count(quick: bool) -> int:
+    """A step is a trained network, or a group of test images of every condition with a number of views."""
+    networks, training, views, groups = sizes(quick)
+    return len(networks) * len(training) + len(views) * groups
+
+
+def steps(quick: bool) -> Iterator[Step]:
+    """Networks, then the parser with every number of views in turn."""
+    networks, training, views, groups = sizes(quick)
+    mug = cache(upright_mug)
+    yaws, each = (QUICK_YAWS, QUICK_GROUP) if quick else (YAWS, GROUP)
+    fixed = cache(lambda: every_yaw(mug(), mug_view(TRAINED, np.random.default_rng(0)), yaws))
+    truth = cache(partial(group_truth, mug, fixed, each))
+    known = cache(partial(known_mug, mug))
+    images = cache(lambda: mug_images(mug(), TRAINED, training[-1], (TRAINING_SEED,)))
+    for size in training:
+        for network in networks:
+            yield partial(_network_rows, network, size, images, partial(_all_groups, truth, groups), quick)
+    for group in range(groups):
+        for seen in views:
+            yield partial(_parser_rows, seen, group, truth, known)
+
+
+def group_truth(
+    mug: Callable[[], UprightMug],
+    fixed: Callable[[], Float[np.ndarray, "K height width"]],
+    each: int,
+    condition: str,
+    group: int,
+) -> Truth:
+    """A group of test images of a condition. The images of a quick run are the first of a full one's. fixed: what the
+    camera would see at every yaw where neither it nor the mug is moved."""
+    drawn = MUG_CONDITIONS[condition]
+    images = mug_images(mug(), drawn, each, (TEST_SEED, list(MUG_CONDITIONS).index(condition), group))
+    clean = fixed() if drawn.one_view else every_yaw(mug(), images.view, len(fixed()))
+    return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]))
+
+
+def _all_groups(truth: Callable[[str, int], Truth], groups: int, condition: str) -> list[Truth]:
+    return [truth(condition, group) for group in range(groups)]
+
+
+def _network_rows(
+    name: str,
+    size: int,
+    images: Callable[[], MugImages],
+    tests: Callable[[str], list[Truth]],
+    quick: bool,
+) -> list[Row]:
+    """A row a condition, of a network trained on so many images."""
+    import jax
+
+    from bayes3d_ros.validation.networks import models, training
+
+    every = images()
+    depth, yaw = SCALE.as_input(every.depth[:size]), every.yaw[:size].astype(np.float32)
+    plan = training.TrainingPlan(most_steps=QUICK_STEPS, check_every=20) if quick else training.TrainingPlan()
+    network = models.DepthNetwork(models.NetworkPlan(*NETWORKS[name]), depth.shape[1:], 2, jax.random.key(0))
+    trained = training.train_best(network, depth, yaw, von_mises.output_loss, plan, seed=size)
+    parameters = models.parameter_count(network)
+    rows = []
+    for condition in MUG_CONDITIONS:
+        scores: list[YawScores] = []
+        groups = tests(condition)
+        for truth in groups:
+            outputs = training.predictions(trained.network, SCALE.as_input(truth.images.depth))
+            scores += _von_mises_scores(von_mises.of_outputs(outputs.astype(float)), truth)
+        row = _row(f"network {name}", size, condition, scores, groups)
+        rows.append(
+            row
+            | {"seconds": round(trained.seconds, 2), "parameters": parameters, "memory_bytes": 4 * parameters}
+            | {"file_bytes": models.file_bytes(network), "rate": trained.rate, "steps": trained.steps}
+            | {"training_loss": round(trained.training_loss, 5), "validation_loss": round(trained.validation_loss, 5)}
+        )
+    return rows
+
+
+def _von_mises_scores(said: Sequence[von_mises.VonMises], truth: Truth) -> list[YawScores]:
+    axis = yaw_axis(truth.posterior.shape[1])
+    return [
+        yaw_scores(q.log_density, axis, exact, yaw)
+        for q, exact, yaw in zip(said, truth.posterior, truth.images.yaw, strict=True)
+    ]
+
+
+def _row(method: str, size: int, condition: str, scores: Sequence[YawScores], groups: Sequence[Truth]) -> Row:
+    """A value an image in each list: of the von Mises, then the exact posterior's own entropy, and the cross-entropy of
+    the best von Mises that there is."""
+    best = [s.cross_entropy for truth in groups for s in _von_mises_scores(_best_fits(truth), truth)]
+    return {
+        "method": method,
+        "training": size,
+        "test": condition,
+        "cross_entropy": [round(s.cross_entropy, 4) for s in scores],
+        "log_p_true": [round(s.log_p_true, 4) for s in scores],
+        "entropy": [round(entropy(exact), 4) for truth in groups for exact in truth.posterior],
+        "best_von_mises": [round(value, 4) for value in best],
+    }
+
+
+def _best_fits(truth: Truth) -> list[von_mises.VonMises]:
+    """The von Mises of least cross-entropy from each exact posterior: its weighted maximum likelihood."""
+    axis = yaw_axis(truth.posterior.shape[1])
+    return [von_mises.fit(axis, exact) for exact in truth.posterior]
+
+
+def known_mug(mug: Callable[[], UprightMug], views: int) -> KnownMug:
+    """A parser of the mug, learned from so many views around it, or (TRUE_MESH) made from the mesh; compiled."""
+    thing, model, turn, seconds = mug().thing, None, 0.0, 0.0
+    if views == TRUE_MESH:
+        model = model_from_mesh(thing.mesh, thing.name, LEARNED.voxel_size)
+    else:
+        captures = capture(thing, np.eye(4), views, (0.0, 0.0), seed=views)
+        start = time.perf_counter()
+        learned = learn(captures.frames, thing.name, LEARNED)
+        seconds = time.perf_counter() - start
+        T_model_mesh = np.linalg.inv(learned.T_table_object) @ captures.T_table_object
+        model, turn = learned.model, float(np.arctan2(T_model_mesh[1, 0], T_model_mesh[0, 0]))
+    library, size = _by_way_of_a_file(model)
+    parser = SceneParser(library, SETTINGS)
+    parser.warm_up(MUG_CAMERA.width, MUG_CAMERA.height)
+    return KnownMug(parser, turn, seconds, size)
+
+
+def _by_way_of_a_file(model: ObjectModel) -> tuple[Library, int]:
+    """The library of one model, as a robot would have it, and the bytes of its file."""
+    with tempfile.TemporaryDirectory(prefix="bayes3d-mug-pose-") as folder:
+        size = save_model(model, Path(folder)).stat().st_size
+        return load_library(Path(folder)), size
+
+
+def _parser_rows(
+    views: int, group: int, truth: Callable[[str, int], Truth], known: Callable[[int], KnownMug]
+) -> list[Row]:
+    """A row a condition, of a group of its images."""
+    mug = known(views)
+    memory = sum(array.nbytes for array in library_arrays(mug.parser.library))
+    rows = []
+    for number, condition in enumerate(MUG_CONDITIONS):
+        start, own = time.perf_counter(), truth(condition, group)
+        fits, densities, failed = [], [], 0
+        for k in range(len(own.images.yaw)):
+            stamp = 1_700_000_000 + (group * len(MUG_CONDITIONS) + number) * GROUP + k
+            said = _samples_of(mug, own.images, k, stamp * 10**9)
+            failed += said is None
+            yaws, weights = said or (yaw_axis(), np.full(len(yaw_axis()), 1 / len(yaw_axis())))  # nothing is known
+            fits.append(von_mises.fit(yaws, weights))
+            densities.append(kernel_density(yaws, weights))
+        seconds = time.perf_counter() - start
+        axis = yaw_axis(own.posterior.shape[1])
+        samples = [
+            yaw_scores(q, axis, exact, yaw)
+            for q, exact, yaw in zip(densities, own.posterior, own.images.yaw, strict=True)
+        ]
+        rows.append(
+            _row(PARSER, views, condition, _von_mises_scores(fits, own), [own])
+            | {"samples_cross_entropy": [round(s.cross_entropy, 4) for s in samples]}
+            | {"samples_log_p_true": [round(s.log_p_true, 4) for s in samples], "failed": failed}
+            | {"seconds": round(seconds, 2), "learning_seconds": round(mug.seconds, 2)}
+            | {"file_bytes": mug.file_bytes, "memory_bytes": memory}
+        )
+    return rows
+
+
+def _samples_of(mug: KnownMug, images: MugImages, k: int, stamp_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Yaws of the true mesh, radians, and their weights; None where nothing is found."""
+    try:
+        posterior = mug.parser.parse(images.frame(k, stamp_ns))
+    except ParseError:
+        return None
+    yaws, weights = weighted_yaws(posterior.samples, images.view.T_table_camera)
+    return yaws + mug.turn, weights
+
+
+def line(row: Row) -> str:
+    """A row, under HEADER."""
+    return (
+        f"{row['method']:<13} {row['training'] or 'mesh':>8} {row['test']:<10} {len(row['cross_entropy']):>6} "
+        f"{np.mean(row['cross_entropy']):>13.3f} {np.mean(row['log_p_true']):>11.3f} {row['seconds']:>7.1f}"
+    )
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """Per condition, method and size of its training (images, or views; `mesh`: none): `images`, means of
+    `cross_entropy` and `log_p_true` (nats), of the parser also those of its samples. Per condition the means of the
+    exact posterior's `entropy` and of the `best_von_mises`. Of each method the bytes to be kept. Then
+    `network_needs`: the fewest training images at which any network has no larger cross-entropy than the parser with
+    most views."""
+    told: dict[str, Any] = {}
+    losses: dict[tuple[str, str, int], float] = {}
+    for condition, method, size in dict.fromkeys((row["test"], row["method"], row["training"]) for row in rows):
+        own = [row for row in rows if (row["test"], row["method"], row["training"]) == (condition, method, size)]
+        losses[condition, method, size] = _mean_of(own, "cross_entropy")
+        keys = ("cross_entropy", "log_p_true", "samples_cross_entropy", "samples_log_p_true")
+        figures = {key: _mean_of(own, key) for key in keys if key in own[0]}
+        told[f"{condition}: {method} {size or 'mesh'}"] = {"images": sum(len(row["entropy"]) for row in own)} | figures
+    for condition in dict.fromkeys(row["test"] for row in rows):
+        own = [row for row in rows if row["test"] == condition]
+        told[f"{condition}: exact"] = {key: _mean_of(own[:1], key) for key in ("entropy", "best_von_mises")}
+    for method in dict.fromkeys(row["method"] for row in rows):
+        biggest = max((row for row in rows if row["method"] == method), key=lambda row: row["file_bytes"])
+        told[f"{method}: size"] = {key: biggest.get(key) for key in ("file_bytes", "memory_bytes", "parameters")}
+    return told | {"network_needs": {c: _needed(losses, c) for c in dict.fromkeys(row["test"] for row in rows)}}
+
+
+def _needed(losses: dict[tuple[str, str, int], float], condition: str) -> int | None:
+    ours = {size: loss for (c, method, size), loss in losses.items() if (c, method) == (condition, PARSER) and size}
+    if not ours:
+        return None
+    theirs = [(size, loss) for (c, method, size), loss in losses.items() if c == condition and method != PARSER]
+    return min((size for size, loss in theirs if loss <= ours[max(ours)]), default=None)
+
+
+def _mean_of(rows: Sequence[Row], key: str) -> float:
+    """Over the images of all rows."""
+    return round(float(np.mean([value for row in rows for value in row[key]])), 4)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The picture of the mug-pose experiment: cross-entropy by what was learned from, in and out of distribution; sizes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from bayes3d_ros.io.palette import INK, colour
+from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame, save_both
+
+PARSER = "Bayes3D"
+LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
+_KIB = 1024
+
+
+def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write mug-pose, as PDF and PNG: a column a condition, then memory; above cross-entropy, below log p(true yaw)."""
+    conditions = list(dict.fromkeys(row["test"] for row in rows))
+    if not conditions:
+        return []
+    figure = Figure(figsize=(2.6 * (len(conditions) + 1), 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(conditions) + 1)
+    for column, condition in zip(axes[:, :-1].T, conditions, strict=True):
+        own = [row for row in rows if row["test"] == condition]
+        _losses(column[0], own, 1.0, ("cross_entropy", "samples_cross_entropy", "best_von_mises"))
+        _losses(column[1], own, -1.0, ("log_p_true", "samples_log_p_true", None))
+        label_plot(column[0], "training images, or views", "cross-entropy, nats", condition, size=8)
+        label_plot(column[1], "training images, or views", "-log p(true yaw), nats", condition, size=8)
+    for axis, key, title in zip(axes[:, -1], ("file_bytes", "memory_bytes"), ("file", "arrays in memory"), strict=True):
+        _sizes(axis, rows, key)
+        label_plot(axis, "KiB", "", title, size=8)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return save_both(figure, folder / "mug-pose")
+
+
+def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, str | None]) -> None:
+    """Means over images; nats that a uniform density has are dotted."""
+    von_mises, samples, best = keys
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    others = [method for method in methods if method != PARSER]
+    for k, method in enumerate(others):
+        _line(axis, rows, method, von_mises, sign, color=colour(k + 2), marker="o", label=method)
+    _line(axis, rows, PARSER, von_mises, sign, color=INK, marker="s", linewidth=2, label="Bayes3D, von Mises")
+    _line(axis, rows, PARSER, samples, sign, color=INK, marker="^", linestyle="--", label="Bayes3D, samples")
+    axis.axhline(np.log(2 * np.pi), color=GREY, linestyle=":", linewidth=1)
+    if best is not None:
+        axis.axhline(float(np.mean(rows[0][best])), color=GREY, linewidth=1, label="best von Mises there is")
+    axis.set_xscale("log")
+    _nats(axis)
+    axis.tick_params(labelsize=8)
+    open_frame(axis)
+
+
+def _nats(axis: Axes) -> None:
+    """An axis of all that is drawn, logarithmic above LINEAR_UP_TO."""
+    values = np.concatenate([np.ravel(line.get_ydata()) for line in axis.get_lines()])
+    low, high = float(values.min()) - 0.5, float(values.max())
+    axis.set_yscale("symlog", linthresh=LINEAR_UP_TO, linscale=2.0)
+    axis.set_yticks([tick for tick in TICKS if low <= tick <= 1.3 * high])
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylim(low, high + 0.5 if high < LINEAR_UP_TO else 1.3 * high)
+
+
+def _line(axis: Axes, rows: Sequence[Row], method: str, key: str, sign: float, **style: object) -> None:
+    own = [row for row in rows if row["method"] == method and row["training"]]
+    sizes = sorted({row["training"] for row in own})
+    if sizes:
+        means = [sign * np.mean([v for row in own if row["training"] == size for v in row[key]]) for size in sizes]
+        axis.plot(sizes, means, markersize=3.5, **style)  # type: ignore[arg-type]
+
+
+def _sizes(axis: Axes, rows: Sequence[Row], key: str) -> None:
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    largest = [max(row[key] for row in rows if row["method"] == method) / _KIB for method in methods]
+    bars = axis.barh(methods, largest, color=[INK if method == PARSER else GREY for method in methods], height=0.6)
+    axis.bar_label(bars, [f"{value:,.0f}" for value in largest], fontsize=7, padding=2)
+    axis.set_xscale("log")
+    axis.set_xlim(right=20 * max(largest))
+    axis.tick_params(labelsize=7)
+    open_frame(axis)

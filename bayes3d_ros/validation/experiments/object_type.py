@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which of two things a box hides in part (Bayes3D, "Object Type Uncertainty"): the parser's p(type) against that of a
+convolutional network trained on 10 to 10,000 images.
+
+Images are those of `occluded_images.py`; both are given the same pixels. The parser is given the camera's pose, the
+models of the box and of both things, and that there are two objects; no pose, and no training. Its p(hammer) is that
+given one box and one other thing.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.objects.library_arrays import library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import save_model
+from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.posterior.types import ParseError, SceneSamples
+from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.validation.experiments import Row, Step
+from bayes3d_ros.validation.experiments.object_type_plot import plot
+from bayes3d_ros.validation.networks.depth_input import DepthScale
+from bayes3d_ros.validation.networks.installed import require_networks
+from bayes3d_ros.validation.simulate.occluded_images import (
+    HIDDEN,
+    OCCLUDED_CAMERA,
+    OCCLUDER,
+    SPREADS,
+    OccludedImages,
+    OccludedThings,
+    hidden_meshes,
+    occluded_images,
+    occluded_things,
+)
+from bayes3d_ros.validation.simulate.scene_file import find_mesh
+from bayes3d_ros.validation.statistics.reliability import LEAST_PROBABILITY, binary_scores
+
+__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+
+TRAINING, QUICK_TRAINING = (10, 30, 100, 300, 1000, 3000, 10_000), (10, 100)
+TESTED, QUICK_TESTED = 1000, 4  # images of each kind
+AT_ONCE = 20  # images of a step of the parser
+TRAINING_SEED, TEST_SEED = 1, 2
+CHANNELS, HIDDEN_LAYER = (16, 32, 64, 128), (794,)  # 3.15 million parameters
+QUICK_STEPS = 60
+SCALE = DepthScale(1.0, 0.3)
+SETTINGS = ParserSettings(fixed_objects=2, max_objects=2, unknown=False, score_width=OCCLUDED_CAMERA.width)
+VOXEL = 0.004  # metres
+PARSER, NETWORK = "Bayes3D", "network"
+HEADER = f"{'method':<8} {'training':>8} {'test':<10} {'images':>6} {'right':>6} {'log loss':>8} {'s':>7}"
+
+
+def notes(quick: bool) -> list[str]:
+    """What the figures are of. Raises NetworksMissingError where networks cannot be trained."""
+    require_networks()
+    left_out = [f"quick: {QUICK_TESTED} images of each kind; networks of {QUICK_TRAINING} images, {QUICK_STEPS} steps"]
+    return [
+        f"a probability below {LEAST_PROBABILITY:g} counts as that in log losses",
+        "networks get depth, scaled, and a channel that is 1 where there is no return",
+        *(left_out if quick else []),
+    ]
+
+
+def count(quick: bool) -> int:
+    """A step is a number of training images, or some images of the parser."""
+    tested = QUICK_TESTED if quick else TESTED
+    return len(QUICK_TRAINING if quick else TRAINING) + len(SPREADS) * -(-tested // AT_ONCE)
+
+
+def steps(quick: bool) -> Iterator[Step]:
+    """Networks first: they take minutes. Then the parser, some images of each kind in turn."""
+    sizes, tested = (QUICK_TRAINING, QUICK_TESTED) if quick else (TRAINING, TESTED)
+    things = cache(occluded_things)
+    tests = cache(partial(test_images, things, tested))
+    training = cache(lambda: occluded_images(things(), SPREADS["as trained"], sizes[-1], (TRAINING_SEED,)))
+    parser = cache(_warm_parser)
+    for size in sizes:
+        yield partial(_network_rows, size, training, tests, quick)
+    for first in range(0, tested, AT_ONCE):
+        for kind in SPREADS:
+            yield partial(_parser_rows, kind, slice(first, min(first + AT_ONCE, tested)), tests, parser)
+
+
+def test_images(things: Callable[[], OccludedThings], tested: int, kind: str) -> OccludedImages:
+    """The images of a kind; those of a quick run are the first of a full one."""
+    return occluded_images(things(), SPREADS[kind], tested, (TEST_SEED, list(SPREADS).index(kind)))
+
+
+def occluded_library() -> Library:
+    """The box, the hammer and the dumbbell."""
+    meshes = {OCCLUDER: find_mesh(OCCLUDER, Path()), **hidden_meshes()}
+    return Library(tuple(model_from_mesh(mesh, name, VOXEL) for name, mesh in meshes.items()))
+
+
+def _warm_parser() -> SceneParser:
+    parser = SceneParser(occluded_library(), SETTINGS)
+    parser.warm_up(OCCLUDED_CAMERA.width, OCCLUDED_CAMERA.height)
+    return parser
+
+
+def _network_rows(
+    size: int, training: Callable[[], OccludedImages], tests: Callable[[str], OccludedImages], quick: bool
+) -> list[Row]:
+    """A row a kind of test images, of the network trained on so many."""
+    import jax
+    import optax
+
+    from bayes3d_ros.validation.networks import models
+    from bayes3d_ros.validation.networks import training as trainer
+
+    every = training()
+    images, kinds = SCALE.as_input(every.depth[:size]), every.kind[:size]
+    plan = trainer.TrainingPlan(most_steps=QUICK_STEPS, check_every=20) if quick else trainer.TrainingPlan()
+    network = models.DepthNetwork(models.NetworkPlan(CHANNELS, HIDDEN_LAYER), images.shape[1:], 2, jax.random.key(0))
+    loss = optax.softmax_cross_entropy_with_integer_labels
+    trained = trainer.train_best(network, images, kinds, loss, plan, seed=size)
+    rows = []
+    for kind in SPREADS:
+        seen = tests(kind)
+        logits = trainer.predictions(trained.network, SCALE.as_input(seen.depth)).astype(float)
+        p = np.exp(logits[:, 0] - np.logaddexp(logits[:, 0], logits[:, 1]))
+        row = _row(NETWORK, size, kind, p, seen)
+        rows.append(
+            row
+            | {"seconds": round(trained.seconds, 2), "parameters": models.parameter_count(network)}
+            | {"file_bytes": models.file_bytes(network), "memory_bytes": 4 * models.parameter_count(network)}
+            | {"rate": trained.rate, "steps": trained.steps, "training_loss": round(trained.training_loss, 5)}
+            | {"validation_loss": round(trained.validation_loss, 5)}
+        )
+    return rows
+
+
+def _parser_rows(
+    kind: str, which: slice, tests: Callable[[str], OccludedImages], parser: Callable[[], SceneParser]
+) -> list[Row]:
+    """A row of some images of a kind."""
+    seen, warm = tests(kind), parser()
+    start, p, failed = time.perf_counter(), [], 0
+    first_stamp = 1_700_000_000 + 100_000 * list(SPREADS).index(kind)
+    for k in range(which.start, which.stop):
+        try:
+            p.append(hammer_probability(warm.parse(seen.frame(k, (first_stamp + k) * 10**9)).samples, warm.library))
+        except ParseError:
+            p.append(0.5)
+            failed += 1
+    seconds = time.perf_counter() - start
+    own = OccludedImages(*(a[which] for a in seen))
+    file_size, memory = model_bytes(warm.library)
+    row = _row(PARSER, 0, kind, np.array(p), own)
+    return [row | {"seconds": round(seconds, 2), "failed": failed, "file_bytes": file_size, "memory_bytes": memory}]
+
+
+def _row(method: str, size: int, kind: str, p: Float[np.ndarray, "N"], seen: OccludedImages) -> Row:
+    """p: of the hammer. `truth` is 1 where it is a hammer."""
+    return {
+        "method": method,
+        "training": size,
+        "test": kind,
+        "p": [round(float(v), 6) for v in p],
+        "truth": [int(k == 0) for k in seen.kind],
+        "visible": [round(float(v), 4) for v in seen.visible],
+    }
+
+
+def hammer_probability(samples: SceneSamples, library: Library) -> float:
+    """p(hammer | one box and one other thing); 1/2 where no sample is of that."""
+    box, *things = (library.names.index(name) for name in (OCCLUDER, *HIDDEN))
+    weight = np.exp(samples.log_weight.astype(float))
+    pairs = np.sort(samples.type[:, :2], 1)
+    hammer, dumbbell = (weight[(pairs == np.sort([box, thing])).all(1)].sum() for thing in things)
+    return float(hammer / (hammer + dumbbell)) if hammer + dumbbell > 0 else 0.5
+
+
+def model_bytes(library: Library) -> tuple[int, int]:
+    """Of the files of all models, and of the arrays that scenes are rendered and searched with."""
+    with tempfile.TemporaryDirectory(prefix="bayes3d-model-size-") as folder:
+        files = sum(save_model(model, Path(folder)).stat().st_size for model in library.models)
+    return files, sum(array.nbytes for array in library_arrays(library))
+
+
+def line(row: Row) -> str:
+    """A row, under HEADER."""
+    scores = binary_scores(np.array(row["p"]), np.array(row["truth"]))
+    return (
+        f"{row['method']:<8} {row['training']:>8} {row['test']:<10} {len(row['p']):>6} {scores.accuracy:>6.3f} "
+        f"{scores.log_loss:>8.3f} {row['seconds']:>7.1f}"
+    )
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """Per method, number of training images and kind of test images: `images`, `accuracy`, `log_loss` (nats),
+    `calibration_error`; sizes of what has to be kept, bytes. Then, per kind, the fewest training images at which a
+    network is as good as the parser in log loss (`network_needs`; null: it never is)."""
+    told: dict[str, Any] = {}
+    for (method, size, kind), own in grouped(rows).items():
+        name = f"{kind}: {method}" + (f" {size}" if size else "")
+        told[name] = {"images": len(own[0])} | {
+            key: None if value is None else round(value, 4) for key, value in binary_scores(*own)._asdict().items()
+        }
+    for method in (PARSER, NETWORK):
+        sizes = [row for row in rows if row["method"] == method]
+        if sizes:
+            told[f"{method}: size"] = {key: sizes[0].get(key) for key in ("file_bytes", "memory_bytes", "parameters")}
+    told["network_needs"] = {kind: _needed(rows, kind) for kind in dict.fromkeys(row["test"] for row in rows)}
+    return told
+
+
+def _needed(rows: Sequence[Row], kind: str) -> int | None:
+    losses = {
+        (method, size): binary_scores(*own).log_loss for (method, size, k), own in grouped(rows).items() if k == kind
+    }
+    ours = losses.get((PARSER, 0))
+    good = [size for (method, size), loss in losses.items() if method == NETWORK and ours is not None and loss <= ours]
+    return min(good, default=None)
+
+
+def grouped(rows: Sequence[Row]) -> dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]]:
+    """p(hammer) and truth by method, number of training images and kind of test images."""
+    found: dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]] = {}
+    for key in dict.fromkeys((row["method"], row["training"], row["test"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["training"], row["test"]) == key]
+        found[key] = (np.concatenate([row["p"] for row in own]), np.concatenate([row["truth"] for row in own]))
+    return found

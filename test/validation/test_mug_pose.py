@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The mug-pose experiment: its images, the exact posterior, scores of densities, and what it says of made-up rows."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
+
+from bayes3d_ros.posterior.types import ParseError
+from bayes3d_ros.validation.experiments import mug_pose
+from bayes3d_ros.validation.experiments.mug_pose import PARSER, KnownMug, Truth
+from bayes3d_ros.validation.networks.von_mises import VonMises
+from bayes3d_ros.validation.reference.exact_yaw import entropy, every_yaw, yaw_axis, yaw_posterior
+from bayes3d_ros.validation.simulate.mug_images import (
+    MUG_CAMERA,
+    MUG_CONDITIONS,
+    TRAINED,
+    mug_images,
+    mug_view,
+    upright_mug,
+)
+from bayes3d_ros.validation.simulate.random_scenes import REALSENSE
+from bayes3d_ros.validation.simulate.shared_error_frames import PlacedObject
+from bayes3d_ros.validation.simulate.small_images import clean_depth
+from bayes3d_ros.validation.statistics.yaw_samples import kernel_density, weighted_yaws, yaw_scores
+
+YAWS = 90
+
+
+@pytest.fixture(scope="module")
+def mug():
+    return upright_mug()
+
+
+@pytest.fixture(scope="module")
+def clean(mug):
+    return every_yaw(mug, mug_view(TRAINED, np.random.default_rng(0)), YAWS)
+
+
+def test_images_are_those_of_their_seed_whatever_their_number(mug):
+    few, more, other = (mug_images(mug, TRAINED, n, (seed,)) for n, seed in ((2, 1), (3, 1), (2, 2)))
+    np.testing.assert_array_equal(few.depth, more.depth[:2])
+    np.testing.assert_array_equal(few.yaw, more.yaw[:2])
+    assert (few.yaw != other.yaw).all()
+    moved = mug_images(mug, MUG_CONDITIONS["moved"], 1, (1,)).view
+    assert 0 < abs(moved.x) <= 0.04 and not MUG_CONDITIONS["moved"].one_view and TRAINED.one_view
+
+
+def test_what_is_rendered_in_a_box_is_what_is_rendered_whole(mug):
+    view = mug_view(MUG_CONDITIONS["camera"], np.random.default_rng(3))
+    placed = PlacedObject(mug.thing, mug.pose(view, 1.0))
+    whole = mug.thing.caster.render(np.linalg.inv(placed.T_table_object) @ view.T_table_camera, MUG_CAMERA).depth
+    bare = clean_depth([], view.T_table_camera, MUG_CAMERA)
+    np.testing.assert_array_equal(clean_depth([placed], view.T_table_camera, MUG_CAMERA), np.fmin(bare, whole))
+
+
+def test_the_posterior_is_flat_where_the_handle_is_hidden_and_sharp_where_it_is_not(clean):
+    """Seen along +y, a handle that points to +y (90 degrees) is behind the mug."""
+    axis = np.degrees(yaw_axis(YAWS))
+    rng = np.random.default_rng(0)
+    away, aside = (yaw_posterior(TRAINED.noise.add(clean[k], rng), clean, TRAINED.noise) for k in (YAWS // 4, 0))
+    hidden = np.abs(axis - 90) < 30
+    np.testing.assert_allclose(away[hidden], away[hidden].mean(), rtol=0.1)  # the body has facets
+    assert away[np.abs(axis - 90) < 45].sum() > 0.999
+    assert axis[aside.argmax()] == 0 and aside.max() > 0.99
+    assert entropy(np.full(YAWS, 1 / YAWS)) == pytest.approx(np.log(2 * np.pi))
+    assert entropy(aside) < entropy(away) < np.log(2 * np.pi)
+
+
+def test_cross_entropy_is_least_of_the_posterior_itself():
+    axis = yaw_axis(720)
+    q = VonMises(1.0, 20.0)
+    exact = np.exp(q.log_density(axis))
+    exact /= exact.sum()
+    own, other = (yaw_scores(d, axis, exact, 1.1) for d in (q.log_density, VonMises(1.2, 20.0).log_density))
+    assert own.cross_entropy == pytest.approx(entropy(exact), abs=1e-9) and own.cross_entropy < other.cross_entropy
+    assert own.log_p_true == pytest.approx(float(q.log_density(np.array([1.1]))[0]))
+
+
+def test_the_density_of_samples_integrates_to_one_and_is_never_zero():
+    density = kernel_density(np.array([0.0, 3.0]), np.array([0.25, 0.75]))
+    axis = yaw_axis(3600)
+    p = np.exp(density(axis)) * 2 * np.pi / len(axis)
+    assert p.sum() == pytest.approx(1, abs=1e-9) and (p > 0).all()
+    assert p[np.abs(axis - 3.0) < 0.3].sum() == pytest.approx(0.75 * 0.99 + 0.01 * 0.6 / (2 * np.pi), abs=1e-4)
+
+
+def samples_of(yaws, log_weight, T_table_camera):
+    turned = T_table_camera[:3, :3].T @ Rotation.from_euler("z", np.reshape(yaws, (-1, 1))).as_matrix()
+    return SimpleNamespace(
+        num_objects=np.ones(len(yaws), int),
+        orientation=Rotation.from_matrix(turned).as_quat()[:, None],
+        log_weight=np.asarray(log_weight),
+    )
+
+
+def test_yaws_of_samples_are_those_in_the_tables_frame():
+    view = mug_view(TRAINED, np.random.default_rng(0))
+    yaws, weights = weighted_yaws(samples_of([0.3, -2.0], np.log([0.2, 0.8]), view.T_table_camera), view.T_table_camera)
+    np.testing.assert_allclose(yaws, [0.3, -2.0])
+    np.testing.assert_allclose(weights, [0.2, 0.8])
+
+
+@pytest.fixture
+def parser_rows(mug, clean):
+    """Rows of a stand-in for a parser that gives samples about the true yaw, or fails."""
+    images = mug_images(mug, TRAINED, 1, (5,))
+    truth = Truth(images, np.array([yaw_posterior(images.depth[0], clean, TRAINED.noise)]))
+    turn = 0.5  # of the true mesh in the frame of the model
+
+    def made(fails: bool):
+        def parse(frame):
+            assert frame.intrinsics == MUG_CAMERA != REALSENSE
+            if fails:
+                raise ParseError("no scene of 1 objects was found")
+            own = images.yaw[0] - turn + np.array([-0.05, 0.05])
+            return SimpleNamespace(samples=samples_of(own, np.log([0.5, 0.5]), frame.T_table_camera))
+
+        known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, 2048)
+        return mug_pose._parser_rows(5, 0, lambda condition, group: truth, lambda views: known)
+
+    return made
+
+
+def test_the_parsers_rows_score_its_samples(parser_rows, monkeypatch):
+    monkeypatch.setattr(mug_pose, "library_arrays", lambda library: [np.zeros(4)])
+    row, *others = parser_rows(False)
+    resultant = float(np.cos(0.05))
+    assert row["log_p_true"][0] == pytest.approx(0.5 * np.log(1 / (2 * (1 - resultant)) / (2 * np.pi)), abs=0.01)
+    assert row["samples_log_p_true"][0] > 0 and row["failed"] == 0 and row["memory_bytes"] == 32
+    assert [row["test"], *(o["test"] for o in others)] == list(MUG_CONDITIONS)
+    lost = parser_rows(True)[0]
+    assert lost["failed"] == 1 and lost["log_p_true"][0] == pytest.approx(-np.log(2 * np.pi), abs=1e-3)
+
+
+def made_up(method, training, loss, test="as trained"):
+    row = {"method": method, "training": training, "test": test, "seconds": 1.0, "memory_bytes": 4000}
+    row |= {"cross_entropy": [loss, loss + 1], "log_p_true": [-loss, -loss], "file_bytes": 1000 * (training + 1)}
+    row |= {"entropy": [-3.0, 0.1], "best_von_mises": [-2.9, 0.2]}
+    if method == PARSER:
+        row |= {"samples_cross_entropy": [0.0, 1.0], "samples_log_p_true": [0.0, 1.0]}
+    return row
+
+
+def test_summary_lines_and_picture(tmp_path):
+    rows = [made_up("network 1 M", 10, 1.5), made_up("network 1 M", 100, 0.2), made_up(PARSER, 1, 0.9)]
+    rows += [made_up(PARSER, 10, 0.3), made_up(PARSER, 10, 0.4), made_up(PARSER, 0, -1.0)]
+    told = mug_pose.summary(rows)
+    assert told["network_needs"] == {"as trained": 100}
+    assert told["as trained: Bayes3D 10"]["cross_entropy"] == 0.85 and told["as trained: Bayes3D 10"]["images"] == 4
+    assert told["as trained: exact"] == {"entropy": -1.45, "best_von_mises": -1.35}
+    assert told["Bayes3D: size"]["file_bytes"] == 11_000
+    rows[1] = made_up("network 1 M", 100, 2.0)
+    assert mug_pose.summary(rows)["network_needs"] == {"as trained": None}
+    paths = mug_pose.plot(rows, tmp_path)
+    assert [path.suffix for path in paths] == [".pdf", ".png"] and all(path.stat().st_size > 1000 for path in paths)
+    assert "mesh" in mug_pose.line(rows[-1]) and mug_pose.plot([], tmp_path) == []
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_steps_are_those_that_are_counted(quick):
+    assert len(list(mug_pose.steps(quick))) == mug_pose.count(quick)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Networks that experiments compare with: the von Mises distribution, what they are given, and that they learn."""
+
+import numpy as np
+import pytest
+from scipy.stats import vonmises
+
+pytest.importorskip("equinox", reason="networks need Equinox and Optax (extra: experiments)")
+pytest.importorskip("optax", reason="networks need Equinox and Optax (extra: experiments)")
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from bayes3d_ros.validation.networks import installed, training, von_mises
+from bayes3d_ros.validation.networks.depth_input import DepthScale
+from bayes3d_ros.validation.networks.models import DepthNetwork, NetworkPlan, file_bytes, parameter_count
+
+PLAN = NetworkPlan((4, 8), (16,))
+QUICK = training.TrainingPlan(rates=(3e-3, 1e-2), batch=16, most_steps=60, check_every=10, patience=3)
+
+
+@pytest.mark.parametrize("concentration", [0.0, 0.5, 30.0, 1e4])
+def test_a_von_mises_density_integrates_to_one_and_is_scipys(concentration):
+    q = von_mises.VonMises(1.2, concentration)
+    angles = np.linspace(-np.pi, np.pi, 20_001)
+    assert np.trapezoid(np.exp(q.log_density(angles)), angles) == pytest.approx(1, abs=1e-9)
+    if concentration:
+        np.testing.assert_allclose(q.log_density(angles), vonmises(concentration, 1.2).logpdf(angles), atol=1e-8)
+
+
+@pytest.mark.parametrize("concentration", [0.3, 4.0, 200.0])
+def test_the_fit_is_scipys(concentration):
+    angles = vonmises(concentration, -2.0).rvs(500, random_state=1)
+    fitted = von_mises.fit(angles)
+    kappa, mean, _ = vonmises.fit(angles, fscale=1)
+    assert fitted.concentration == pytest.approx(kappa, rel=1e-6)
+    assert np.cos(fitted.mean - mean) == pytest.approx(1, abs=1e-9)
+
+
+def test_the_fit_of_weighted_angles_is_that_of_repeated_ones():
+    angles, times = np.array([0.1, 0.4, 3.0]), np.array([5, 3, 1])
+    assert von_mises.fit(angles, times / 9) == pytest.approx(von_mises.fit(np.repeat(angles, times)), rel=1e-9)
+
+
+def test_the_fit_of_equal_angles_is_bounded_and_of_opposite_ones_uniform():
+    assert von_mises.fit(np.full(4, 2.0)) == (pytest.approx(2.0), von_mises.LARGEST_CONCENTRATION)
+    assert von_mises.fit(np.array([0.0, np.pi])).concentration == pytest.approx(0, abs=1e-9)
+
+
+def test_the_loss_of_outputs_is_minus_the_log_density_and_has_a_gradient_where_it_is_uniform():
+    outputs, angles = np.array([[3.0, -4.0], [0.2, 0.1], [0.0, 0.0], [-90.0, 2.0]]), np.array([0.3, -1.0, 2.0, 3.1])
+    loss = np.asarray(von_mises.output_loss(jnp.asarray(outputs), jnp.asarray(angles)))
+    said = [float(q.log_density(a)) for q, a in zip(von_mises.of_outputs(outputs), angles, strict=True)]
+    np.testing.assert_allclose(loss, -np.array(said), atol=1e-4)
+    gradient = jax.grad(lambda o: von_mises.output_loss(o, jnp.asarray(angles)).sum())(jnp.asarray(outputs))
+    np.testing.assert_allclose(gradient[2], [-np.cos(2.0), -np.sin(2.0)], atol=1e-5)  # uniform: towards the angle
+
+
+def test_missing_returns_have_a_channel_of_their_own():
+    images = DepthScale(1.0, 0.5).as_input(np.array([[[1.0, np.nan], [1.5, 90.0]]], np.float32))
+    assert images.dtype == np.float32
+    np.testing.assert_array_equal(images, [[[[0, 0], [1, 5]], [[0, 1], [0, 0]]]])
+
+
+@pytest.fixture
+def halves():
+    """Images of which the left or the right half is nearer, and which."""
+    rng = np.random.default_rng(0)
+    side = rng.integers(2, size=40)
+    images = rng.normal(0, 0.3, (40, 2, 8, 9)).astype(np.float32)
+    for k, s in enumerate(side):
+        images[k, 0, :, 5 * s : 4 + 5 * s] -= 1
+    return images, side
+
+
+def test_training_learns_what_can_be_learned_and_is_repeatable(halves):
+    images, side = halves
+    network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
+    loss = optax.softmax_cross_entropy_with_integer_labels
+    before = training.mean_loss(network, images, side, loss)
+    trained, again = (training.train_best(network, images, side, loss, QUICK, seed=3) for _ in range(2))
+    assert before > 0.5 and trained.validation_loss < 0.05 and trained.training_loss < 0.05
+    assert trained._replace(network=None, seconds=0) == again._replace(network=None, seconds=0)
+    said = training.predictions(trained.network, images)
+    assert said.shape == (40, 2) and (said.argmax(1) == side).all()
+    np.testing.assert_array_equal(said[:3], training.predictions(trained.network, images[:3]))
+
+
+def test_training_stops_where_validation_gets_no_better(halves):
+    """Targets that say nothing can only be learned by heart: the best look is an early one, and its network is kept."""
+    images, _ = halves
+    targets = np.random.default_rng(1).integers(2, size=len(images))
+    network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
+    loss = optax.softmax_cross_entropy_with_integer_labels
+    plan = QUICK._replace(rates=(1e-2,), most_steps=10_000, validation=0.5)
+    trained = training.train_best(network, images, targets, loss, plan, seed=0)
+    assert trained.steps < 300
+    assert training.mean_loss(trained.network, images[20:], targets[20:], loss) == trained.validation_loss
+    with pytest.raises(ValueError, match="two images"):
+        training.train_best(network, images[:1], targets[:1], loss, plan, seed=0)
+
+
+def test_sizes_of_networks():
+    network = DepthNetwork(PLAN, (2, 8, 9), 2, jax.random.key(0))
+    by_hand = (2 * 9 + 1) * 4 + (4 * 9 + 1) * 8 + (8 * 2 * 3 + 1) * 16 + 17 * 2
+    assert parameter_count(network) == by_hand
+    assert 4 * by_hand < file_bytes(network) < 4 * by_hand + 2000
+
+
+def test_missing_packages_are_told_in_one_line(monkeypatch):
+    installed.require_networks()
+    monkeypatch.setattr(installed, "PACKAGES", ("equinox", "no_such_package"))
+    with pytest.raises(installed.NetworksMissingError, match=r"^networks need no_such_package, .*\[experiments\]'$"):
+        installed.require_networks()
