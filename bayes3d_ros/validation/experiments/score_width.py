@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from bayes3d_ros.io.palette import colour
 from bayes3d_ros.objects.model import Library
@@ -184,6 +185,10 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     _against_shipped(types, rows, KINDS[1], "p_true", 1.0, "p(true type) of two boxes, 1.5 mm apart")
     for axis in (position, yaw):
         axis.set(xscale="log", yscale="log")
+        for side in (axis.xaxis, axis.yaxis):
+            side.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            side.set_major_formatter(ScalarFormatter())
+            side.set_minor_formatter(NullFormatter())
     path = folder / "score_width.png"
     figure.savefig(path, dpi=110)
     return [path]
