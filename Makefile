@@ -2,6 +2,7 @@
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
 # make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
 # make demo-unknown  meet an object that no library holds, learn it from two views, find it; results in out/demo-unknown
+# make paper   run all that the Bayes3D paper shows, for hours; results in out/paper, pages in docs/validation;  QUICK=--quick  a short form
 # make test    all tests, two files at a time;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
@@ -13,6 +14,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT := out/demo
+PAPER_OUT := out/paper
+QUICK :=
 PYTEST_ARGS :=
 WORKERS := 2
 COLCON_TESTS :=
@@ -20,7 +23,7 @@ COLCON_TESTS :=
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo demo-learn demo-unknown test lint colcon clean
+.PHONY: help setup demo demo-learn demo-unknown paper test lint colcon clean
 help:
 	@sed -n 's/^# \(make\)/\1/p' Makefile
 
@@ -53,6 +56,11 @@ demo-learn: setup
 
 demo-unknown: setup
 	$(BIN)/bayes3d demo --unknown --out $(OUT)-unknown
+
+PAPER := mug-pose object-type noise-ablation real-scenes camera-tracking
+paper: setup
+	for name in $(PAPER); do $(BIN)/bayes3d evaluate $$name $(QUICK) --out $(PAPER_OUT) || exit; done
+	$(BIN)/bayes3d report $(PAPER_OUT) --out docs/validation
 
 test: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)

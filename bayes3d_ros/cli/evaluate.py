@@ -9,34 +9,42 @@ from typing import Any
 
 import click
 
+from bayes3d_ros.cli.errors import InputError
 from bayes3d_ros.cli.options import FOLDER, device_option
 from bayes3d_ros.cli.progress import progress, say
 from bayes3d_ros.cli.unfinished import CannotGoOnError, left_over
 from bayes3d_ros.files.atomic import write_json
 from bayes3d_ros.validation.commit import commit
-from bayes3d_ros.validation.experiments import EXPERIMENTS, Experiment
+from bayes3d_ros.validation.experiments import EXPERIMENTS, ON_FOLDER, Experiment
 
 
 @click.command()
 @click.argument("experiment", type=click.Choice(list(EXPERIMENTS)))
+@click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--quick", is_flag=True, help="A run of a minute or a few, with fewer scenes.")
 @click.option(
     "--fresh", is_flag=True, help="Start anew. Default: an interrupted run of the same kind in OUT is continued."
 )
 @click.option("--out", required=True, type=FOLDER, help="Folder for EXPERIMENT.json and its pictures.")
 @device_option
-def evaluate(experiment: str, quick: bool, fresh: bool, out: Path) -> None:
+def evaluate(experiment: str, folder: Path | None, quick: bool, fresh: bool, out: Path) -> None:
     """Measure how right the results are: rows as JSON, a summary and pictures.
+
+    FOLDER is for real-scenes only: the recordings that it parses. Default: the folder BAYES3D_DATA, else
+    ../shared/data.
 
     docs/outputs.md says what each experiment measures. `bayes3d report` makes a page of each.
     """
+    if folder is not None and experiment not in ON_FOLDER:
+        raise InputError(f"{folder}: expected no FOLDER, {experiment} takes none ({', '.join(ON_FOLDER)} does)")
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.validation import experiments
     from bayes3d_ros.validation.bench import benchmark
 
     enable_cache()
     every_core()
-    module = experiments.load(experiment)
+    on_folder = experiment in ON_FOLDER
+    module = experiments.load_on_folder(experiment, folder, out) if on_folder else experiments.load(experiment)
     report: dict[str, Any] = {"experiment": experiment, "quick": quick, "notes": module.notes(quick), "summary": None}
     report |= {"machine": benchmark.machine(), "versions": benchmark.versions(), "sources": benchmark.sources()}
     started = datetime.now(UTC).isoformat(timespec="seconds")

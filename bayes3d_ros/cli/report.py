@@ -23,11 +23,16 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
     experiment measures, the command, commit, date and machine, and the summary with what is wanted. In folders, files
     of other programs are passed over, and unfinished experiments are named on stderr; a file that you name must be
     a finished experiment.
+
+    If any of them answers a claim of the Bayes3D paper, paper.md holds all of its claims against the reports that are
+    given; claims of other experiments are "not run".
     """
     from bayes3d_ros.validation.experiments import load, wanted
-    from bayes3d_ros.validation.report import ReportError, page, read_report
+    from bayes3d_ros.validation.paper_page import PAPER_PAGE, answers_the_paper, paper_page
+    from bayes3d_ros.validation.report import Report, ReportError, page, read_report
 
     found: dict[str, Path] = {}
+    contents: dict[str, Report] = {}
     pages: list[tuple[Path, str]] = []
     for file, named in _files(reports):
         try:
@@ -40,11 +45,13 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         name = content["experiment"]
         if name in found and found[name].resolve() != file.resolve():
             raise InputError(f"{file}: expected one report of {name}, {found[name]} is another")
-        found[name] = file
+        found[name], contents[name] = file, content
         module = load(name)
         pages.append((out / f"{name}.md", page(content, module.__doc__ or "", wanted(module))))
     if not pages:
         raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
+    if answers_the_paper(contents):
+        pages.append((out / PAPER_PAGE, paper_page(contents)))
     out.mkdir(parents=True, exist_ok=True)
     for path, text in pages:
         with whole_file(path) as handle:

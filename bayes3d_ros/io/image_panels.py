@@ -2,10 +2,11 @@
 
 """Images of a parsed frame: depth, what the scene explains of it, and which pixels are whose."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_rgb
@@ -15,6 +16,26 @@ from bayes3d_ros.io.palette import INK, NO_RETURN, UNKNOWN_GREY, colour
 from bayes3d_ros.posterior.types import ScenePosterior
 
 _RESIDUAL_MM = 10.0  # millimetres at the ends of the residual's colours
+
+
+class LabelledObject(Protocol):
+    """An object of a segmentation."""
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether it is of no type in the library."""
+
+
+class LabelledScene(Protocol):
+    """What panels of a segmentation show: a ScenePosterior, or what is kept of one."""
+
+    @property
+    def segmentation(self) -> Int[np.ndarray, "height width"]:
+        """0 where no object is, k + 1 where objects[k] is seen."""
+
+    @property
+    def objects(self) -> Sequence[LabelledObject]:
+        """In the order of their labels."""
 
 
 def depth_panel(axis: Axes, depth: Float[np.ndarray, "height width"], scale: Normalize, title: str) -> Any:
@@ -33,7 +54,7 @@ def residual_panel(axis: Axes, depth: Float[np.ndarray, "height width"], posteri
     return image
 
 
-def segmentation_panel(axis: Axes, posterior: ScenePosterior) -> None:
+def segmentation_panel(axis: Axes, posterior: LabelledScene) -> None:
     """Every object's pixels in its colour."""
     picture = np.ones((*posterior.segmentation.shape, 3))
     for label in range(1, len(posterior.objects) + 1):
@@ -83,11 +104,11 @@ def place_number(
     )  # fmt: skip
 
 
-def _tone(posterior: ScenePosterior, label: int) -> str:
+def _tone(posterior: LabelledScene, label: int) -> str:
     return UNKNOWN_GREY if posterior.objects[label - 1].is_unknown else colour(label)
 
 
-def _number_objects(axis: Axes, posterior: ScenePosterior) -> None:
+def _number_objects(axis: Axes, posterior: LabelledScene) -> None:
     for label, found in enumerate(posterior.objects, 1):
         v, u = np.nonzero(posterior.segmentation == label)
         if len(v):

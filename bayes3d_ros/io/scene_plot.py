@@ -35,11 +35,24 @@ def plot_scene(
     models: Mapping[str, ObjectModel] | None = None,
     view: TableView | None = None,
 ) -> Path:
-    """Write a PNG of 1920 x 1080 pixels: the input with the objects' outlines, the reconstruction, the one minus the
-    other, segmentation, the table from above with what is not known of poses, and a table of numbers with a verdict.
+    """Write the figure of `scene_figure` as a PNG of 1920 x 1080 pixels. Returns `path`."""
+    scene_figure(depth, posterior, title, intrinsics, models, view).savefig(path, dpi=100)
+    return path
+
+
+def scene_figure(
+    depth: Float[np.ndarray, "height width"],
+    posterior: ScenePosterior,
+    title: str = "",
+    intrinsics: Intrinsics | None = None,
+    models: Mapping[str, ObjectModel] | None = None,
+    view: TableView | None = None,
+) -> Figure:
+    """The input with the objects' outlines, the reconstruction, the one minus the other, segmentation, the table from
+    above with what is not known of poses, and a table of numbers with a verdict. 19.2 x 10.8 inches.
 
     depth in metres, NaN where there is no return. models: by type, for boxes and outlines from above. view: what the
-    pictures of a recording have in common; by default this frame's own. Returns `path`.
+    pictures of a recording have in common; by default this frame's own.
     """
     figure = Figure(figsize=(19.2, 10.8), facecolor="white")
     FigureCanvasAgg(figure)
@@ -64,5 +77,4 @@ def plot_scene(
         axis.apply_aspect()  # so that scales go below the images as they are drawn
     scale_below(figure, image, measured, "depth, m (yellow: near)")
     scale_below(figure, residual, difference, "mm (red: nearer than the scene, blue: farther)")
-    figure.savefig(path, dpi=100)
-    return path
+    return figure

@@ -47,8 +47,8 @@ def page(report: Report, about: str, wanted: Wanted) -> str:
     """The page of an experiment. about: what it measures, the docstring of its module; wanted: see `experiments`."""
     name = report["experiment"]
     command = f"bayes3d evaluate {name}{' --quick' if report.get('quick') else ''} --out DIR"
-    parts = [f"# {name}", "<!-- Made by `bayes3d report`: do not edit. -->", *_paragraphs(about), f"    {command}"]
-    parts.append(_table(("", ""), _circumstances(report)))
+    parts = [f"# {name}", "<!-- Made by `bayes3d report`: do not edit. -->", *paragraphs(about), f"    {command}"]
+    parts.append(markdown_table(("", ""), _circumstances(report)))
     if notes := report.get("notes"):
         parts.append("\n".join(f"- {note}" for note in notes))
     parts += ["## Summary", *_summary_tables(report["summary"], wanted)]
@@ -58,9 +58,11 @@ def page(report: Report, about: str, wanted: Wanted) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _paragraphs(about: str) -> list[str]:
-    paragraphs = " ".join(about.split(" ")).strip().split("\n\n")
-    return [textwrap.fill(" ".join(text.split()), _WIDTH, break_on_hyphens=False) for text in paragraphs]
+def paragraphs(about: str) -> list[str]:
+    """Paragraphs of a docstring, filled anew."""
+    return [
+        textwrap.fill(" ".join(text.split()), _WIDTH, break_on_hyphens=False) for text in about.strip().split("\n\n")
+    ]
 
 
 def _circumstances(report: Report) -> Iterator[tuple[str, str]]:
@@ -77,6 +79,12 @@ def _circumstances(report: Report) -> Iterator[tuple[str, str]]:
     device = f"JAX on {machine['device']}" if "device" in machine else ""
     yield "machine", ", ".join(part for part in (*told, device, machine.get("system", "")) if part)
     yield "versions", ", ".join(f"{package} {version}" for package, version in versions.items()) or "not recorded"
+
+
+def measured_at(report: Report) -> str:
+    """Commit and date of every part of the run, on one line."""
+    runs = report.get("runs") or [{}]
+    return "; then ".join(f"{_commit(run.get('commit'))}, {_date(run.get('started'))}" for run in runs)
 
 
 def _commit(commit: str | None) -> str:
@@ -122,7 +130,7 @@ def _side_by_side(groups: Mapping[str, Mapping[Place, Any]], wanted: Wanted) -> 
     for name, limit in zip(names, limits, strict=True):
         values = [_words(group[name]) for group in groups.values()]
         rows.append((" ".join(name), *values, *([limit] if any(limits) else [])))
-    return _table(("", *groups, *(["wanted"] if any(limits) else [])), rows)
+    return markdown_table(("", *groups, *(["wanted"] if any(limits) else [])), rows)
 
 
 def _limit(place: Place, wanted: Wanted) -> str:
@@ -143,6 +151,7 @@ def _words(value: Any) -> str:
     return "-" if value is None or value == {} else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> str:
+    """A table of Markdown with these columns."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -30,10 +30,14 @@ EXPERIMENTS: dict[str, str] = {
     "open-world": "bayes3d_ros.validation.experiments.open_world",
     "parsing": "bayes3d_ros.validation.experiments.parsing",
     "planted": "bayes3d_ros.validation.experiments.planted",
+    "real-scenes": "bayes3d_ros.validation.experiments.real_scenes",
     "repeatability": "bayes3d_ros.validation.experiments.repeatability",
     "score-width": "bayes3d_ros.validation.experiments.score_width",
     "type-odds": "bayes3d_ros.validation.experiments.type_odds",
 }
+
+# Of them those that measure the recordings of a folder, which may be named: their modules are FolderExperiments.
+ON_FOLDER = frozenset({"real-scenes"})
 
 
 class Experiment(Protocol):
@@ -69,6 +73,14 @@ class Experiment(Protocol):
         """Write pictures into the folder; returns their paths."""
 
 
+class FolderExperiment(Protocol):
+    """What the module of an experiment of ON_FOLDER offers besides."""
+
+    def on_folder(self, folder: Path | None, out: Path | None) -> Experiment:
+        """The experiment on the recordings of a folder (None: its default), which may write pictures into `out` while
+        it runs. Raises BagError where a folder that is named has no recordings."""
+
+
 def row_step(row: Callable[Of, Row], *arguments: Of.args, **options: Of.kwargs) -> Step:
     """A step of one row: that of these arguments."""
     return lambda: [row(*arguments, **options)]
@@ -77,6 +89,11 @@ def row_step(row: Callable[Of, Row], *arguments: Of.args, **options: Of.kwargs) 
 def wanted(experiment: Experiment) -> Wanted:
     """What is wanted of the numbers of an experiment's summary; empty where it has no limits."""
     return dict(getattr(experiment, "WANTED", {}))
+
+
+def load_on_folder(name: str, folder: Path | None, out: Path) -> Experiment:
+    """An experiment of ON_FOLDER, see `FolderExperiment`. Raises KeyError for a name that EXPERIMENTS lacks."""
+    return cast(FolderExperiment, import_module(EXPERIMENTS[name])).on_folder(folder, out)
 
 
 def load(name: str) -> Experiment:

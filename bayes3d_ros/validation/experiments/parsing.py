@@ -149,9 +149,8 @@ def frame_rows(
         rows.append(where | {"what": "object", **_object_row(thing, estimate, surfaces)})
     others = [estimate for k, estimate in enumerate(posterior.objects) if k not in partner.values()]
     for estimate in others:
-        numbers = {**_sureness(estimate), "position": [round(float(v), 6) for v in estimate.position]}
         what = "unknown thing" if estimate.type == UNKNOWN else "false object"
-        rows.append(where | {"what": what, "type": estimate.type, **numbers})
+        rows.append(where | {"what": what, "type": estimate.type, **listed_numbers(estimate)})
     frame = {
         "what": "frame",
         "objects": len(true),
@@ -199,7 +198,7 @@ def _object_row(
     row |= dict.fromkeys(("probability", "type_probability", "sigma"))
     row |= dict.fromkeys(("add_s", "position_error", "rotation_error", "distance", "covered", "outside"))
     if estimate is not None:
-        row |= _sureness(estimate)
+        row |= sureness(estimate)
         if thing.T_camera_object is not None:
             pose, truth = estimated_pose(estimate), thing.T_camera_object
             error, covariance = truth[:3, 3] - estimate.position, np.asarray(estimate.covariance_all[:3, :3], float)
@@ -213,7 +212,13 @@ def _object_row(
     return row
 
 
-def _sureness(estimate: ObjectEstimate) -> Row:
+def listed_numbers(estimate: ObjectEstimate) -> Row:
+    """Of a listed object that stands for no true one: how sure the posterior is, and where it puts the object."""
+    return {**sureness(estimate), "position": [round(float(v), 6) for v in estimate.position]}
+
+
+def sureness(estimate: ObjectEstimate) -> Row:
+    """p(exists), p(type), and the root of the trace of the position's covariance, metres."""
     return {
         "probability": round(float(estimate.probability), 6),
         "type_probability": round(float(estimate.type_probabilities[estimate.type]), 6),

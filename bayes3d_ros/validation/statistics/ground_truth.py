@@ -26,7 +26,8 @@ class GroundTruth:
     """The true objects of every frame of a recording.
 
     Three kinds of file: `frames`, each with its stamp and objects (of `bayes3d simulate`); `object` and
-    `T_camera_object`, a single object, wholly visible, in every frame; `objects`, names only. Raises BagError.
+    `T_camera_object`, a single object, wholly visible, in every frame; `objects`, names only. Of any of them `unknown`
+    names what stands there and is of no library, in every frame. Raises BagError.
     """
 
     def __init__(self, bag: Path) -> None:
@@ -36,6 +37,7 @@ class GroundTruth:
         try:
             content = json.loads(self._file.read_text())
             self.pose_noise = bool(content.get("pose_noise"))  # whether the camera poses are wrong on purpose
+            self.unknown = _names(content.get("unknown", []))
             if "frames" in content:
                 self._frames = {f["stamp_ns"]: [_simulated(o) for o in f["objects"]] for f in content["frames"]}
             elif "object" in content:
@@ -44,6 +46,12 @@ class GroundTruth:
                 self._always = [TrueObject(str(name), None, None) for name in content["objects"]]
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise BagError(f"{self._file}: expected frames, object or objects ({error!r})") from None
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The types of all true objects, each once, in the order of the file."""
+        every = self._always or [thing for frame in self._frames.values() for thing in frame]
+        return tuple(dict.fromkeys(thing.type for thing in every))
 
     def at(self, stamp_ns: int) -> list[TrueObject]:
         """The objects of the frame with this stamp. Raises BagError where it is not in the file."""
@@ -56,6 +64,12 @@ class GroundTruth:
 
 def _simulated(content: dict[str, Any]) -> TrueObject:
     return TrueObject(content["name"], _pose(content["T_camera_object"]), float(content["visible_fraction"]))
+
+
+def _names(content: Any) -> tuple[str, ...]:
+    if not isinstance(content, list):
+        raise ValueError("unknown: expected a list of names")
+    return tuple(map(str, content))
 
 
 def _pose(rows: Any) -> Float[np.ndarray, "4 4"]:
