@@ -106,6 +106,18 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
     assert last == f"3 frames parsed; results in {out}" and not result.stderr
 
 
+@pytest.mark.parametrize(("every", "stamps"), [(1, [1, 2, 3]), (2, [1, 3]), (3, [1]), (100, [1])])
+def test_parse_takes_every_nth_image(bag, library, parsers, tmp_path, every, stamps):
+    out = tmp_path / "out"
+    result = run("parse", bag, "--library", library, "--out", out, "--every", every)
+    assert result.exit_code == 0, result.output
+    assert [json.loads(text)["stamp_ns"] for text in (out / "scenes.jsonl").read_text().splitlines()] == stamps
+    first, *_, last = result.stdout.splitlines()
+    count = f"{len(stamps)} depth image{'s' * (len(stamps) != 1)} of /depth/image_rect"
+    assert first.startswith(f"{bag}: {count}" + (f" (1 of every {every}), " if every > 1 else ", "))
+    assert last.startswith(f"{len(stamps)} frame{'s' * (len(stamps) != 1)} parsed; ")
+
+
 def test_errors_of_recorded_camera_poses_widen_what_is_told_on_the_table(bag, library, parsers, tmp_path):
     told = []
     for words in ((), ("--camera-pose-sigma", 0.01, 0.02)):
@@ -210,6 +222,8 @@ def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers,
         (["--set", "sigma_max=nan"], "sigma_max must lie in"),
         (["--max-objects", "-1"], "max_objects must lie in"),
         (["--particles", "many"], "--particles"),
+        (["--every", "0"], "--every"),
+        (["--every", "half"], "--every"),
         (["--nonsense"], "--nonsense"),
         (["--table", "wood"], "'auto', 'pose', 'depth'"),
         (["too", "much"], "unexpected extra arguments"),
@@ -576,6 +590,15 @@ def test_mcap_writes_what_the_node_would_publish(bag, library, followers, tmp_pa
     name = {"parse": "/scene_parser/poses", "track": "/camera_tracker/camera_pose"}[command]
     told = topics(file)
     assert told[name].count == told["/tf"].count == 3
+
+
+def test_mcap_holds_the_images_that_were_parsed(bag, library, parsers, tmp_path):
+    pytest.importorskip("rclpy")
+    file, out = tmp_path / "told.mcap", tmp_path / "out"
+    result = run("parse", bag, "--library", library, "--out", out, "--mcap", file, "--every", 2)
+    assert result.exit_code == 0, result.output
+    assert [frame.stamp_ns for frame in read_frames(file)] == [1, 3]
+    assert topics(file)["/scene_parser/poses"].count == 2
 
 
 def test_mcap_without_ros_or_with_a_wrong_name_is_one_line_before_anything_is_read(
