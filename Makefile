@@ -1,10 +1,11 @@
-# make setup   a virtual environment in .venv with everything in it (demo, test, lint and colcon do it first)
+# make setup   a virtual environment in .venv with everything in it (the other targets do it first)
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
 # make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
 # make demo-unknown  meet an object that no library holds, learn it from two views, find it; results in out/demo-unknown
 # make paper   run all that the Bayes3D paper shows, for hours; results in out/paper, pages in docs/validation;  QUICK=--quick  a short form
 # make test    all tests, two files at a time;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
+# make build   build the package into install/ with colcon, for ros2 run and ros2 launch
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
 # make clean   remove .venv and everything built
 #
@@ -23,7 +24,7 @@ COLCON_TESTS :=
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo demo-learn demo-unknown paper test lint colcon clean
+.PHONY: help setup demo demo-learn demo-unknown paper test lint build colcon clean
 help:
 	@sed -n 's/^# \(make\)/\1/p' Makefile
 
@@ -70,8 +71,10 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-colcon: setup
+build: setup
 	. $(BIN)/activate && colcon --log-base build/colcon-log build --paths . --build-base build/colcon --install-base install
+
+colcon: build
 	. $(BIN)/activate && . install/local_setup.sh && colcon --log-base build/colcon-log test --paths . \
 	    --build-base build/colcon --install-base install --event-handlers console_direct+ --return-code-on-test-failure \
 	    --pytest-args $(COLCON_TESTS)

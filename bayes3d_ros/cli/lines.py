@@ -17,9 +17,11 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(word.ljust(n) for word, n in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def recording_line(frames: "FrameReader") -> str:
-    """The bag, how many frames are read of it, and from which topics."""
+def recording_line(frames: "FrameReader", every: int = 1) -> str:
+    """The bag, how many frames are read of it, and from which topics. every: of the recorded images, each so many-th is
+    read."""
     count = f"{len(frames)} depth image{'s' * (len(frames) != 1)} of {frames.depth_topic}"
+    count += f" (1 of every {every})" if every > 1 else ""
     return f"{frames.bag}: {count}, CameraInfo of {frames.info_topic}, {frames.pose_told}"
 
 

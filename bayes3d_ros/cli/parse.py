@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""`bayes3d parse`: every depth frame of a bag into a posterior over scenes."""
+"""`bayes3d parse`: the depth frames of a bag, each into a posterior over scenes."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,6 +40,14 @@ if TYPE_CHECKING:  # everything heavy is imported where it is used: --help must 
     "--out", required=True, type=FOLDER, help="Folder for scenes.jsonl, samples.npz, summary.png and frames/."
 )
 @topic_option
+@click.option(
+    "--every",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Parse only every N-th depth image, beginning with the first: 30 takes one a second of a recording at 30 Hz.",
+)
 @click.option(
     "--table",
     type=click.Choice(["auto", "pose", "depth"]),
@@ -84,13 +92,14 @@ def parse(
     library: Path,
     out: Path,
     topic: str | None,
+    every: int,
     table_frame: str,
     more: tuple[str, ...],
     sigma: tuple[float, float],
     mcap: Path | None,
     **options: Any,
 ) -> None:
-    """Parse every depth frame of BAG into a posterior over scenes.
+    """Parse the depth frames of BAG, each into a posterior over scenes.
 
     BAG is an MCAP file, or a rosbag2 folder of such. Results in OUT: scenes.jsonl (the best scene of each frame, and
     how sure each part of it is), samples.npz (the posterior), a picture of each frame, and summary.png (the whole bag).
@@ -105,8 +114,8 @@ def parse(
     settings = settings_from(ParserSettings, more, options)
     models = load_library(library)
     check_type_names(settings.types, models)
-    frames = read_frames(bag, topic, table_frame)
-    click.echo(recording_line(frames))
+    frames = read_frames(bag, topic, table_frame, every)
+    click.echo(recording_line(frames, every))
     results = ResultsWriter(out, type_names(models, settings.knows_unknown), sigma)
     told = (mcap, table_frame, models, settings.knows_unknown)
     recording = writers.SceneRecording(*told) if writers else NoRecording()

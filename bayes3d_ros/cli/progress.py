@@ -12,7 +12,7 @@ import click
 from tqdm import tqdm
 
 Item = TypeVar("Item")
-COMPILING = "compiling, about a minute the first time"
+COMPILING = "compiling, some minutes the first time"
 _TICK = 0.5  # seconds between two looks at the clock
 
 

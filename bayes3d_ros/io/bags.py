@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +41,17 @@ __all__ = [
 ]
 
 
-def read_frames(bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME) -> "FrameReader":
-    """The depth frames of a bag: iterate over them; `len` is their number."""
-    return FrameReader(bag, depth_topic, table_frame)
+def read_frames(
+    bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME, every: int = 1
+) -> "FrameReader":
+    """The depth frames of a bag, or every so many-th of them: iterate over them; `len` is their number."""
+    return FrameReader(bag, depth_topic, table_frame, every)
 
 
 class FrameReader:
     """The depth frames of a bag in the order of recording; `len` is their number (unreadable ones included).
 
+    every: of the recorded images, the first and every so many-th after it are read; the others are left out unread.
     depth_topic: Image, or CompressedImage of image_transport's compressedDepth; chosen as bag_topics.py says.
     info_topic: `camera_info` beside the depth topic, or the only CameraInfo topic. A frame takes the CameraInfo of its
         stamp; else, of those of its size, the latest before it; else the first after it.
@@ -61,8 +65,13 @@ class FrameReader:
     last frame one BagDamage says what was lost.
     """
 
-    def __init__(self, bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME) -> None:
+    def __init__(
+        self, bag: Path, depth_topic: str | None = None, table_frame: str = TABLE_FRAME, every: int = 1
+    ) -> None:
+        if every < 1:
+            raise ValueError(f"every must be 1 or more, got {every}")
         self.bag = bag
+        self._every = every
         contents = read_contents(bag)
         self.depth_topic = choose_depth_topic(contents, depth_topic)
         self.info_topic = choose_info_topic(contents, self.depth_topic)
@@ -75,20 +84,19 @@ class FrameReader:
         return self._poses.told
 
     def __len__(self) -> int:
-        return self._count
+        return -(-self._count // self._every)
 
     def __iter__(self) -> Iterator[DepthFrame]:
         lost: list[str] = []
         damage = ""
         try:
-            for message in raw_messages(self.bag):
-                if message.topic == self.depth_topic:
-                    try:
-                        frame = self._frame(message)
-                    except (ValueError, BagError) as error:
-                        lost.append(str(error))
-                        continue
-                    yield frame
+            for message in self._images():
+                try:
+                    frame = self._frame(message)
+                except (ValueError, BagError) as error:
+                    lost.append(str(error))
+                    continue
+                yield frame
         except BagDamage as error:
             damage = str(error)
         if lost:
@@ -102,8 +110,7 @@ class FrameReader:
         wanted = set(np.linspace(0, len(self) - 1, min(most, len(self))).astype(int).tolist())
         frames = []
         with suppress(BagDamage):
-            images = (message for message in raw_messages(self.bag) if message.topic == self.depth_topic)
-            for k, message in enumerate(images):
+            for k, message in enumerate(self._images()):
                 if k in wanted:
                     with suppress(ValueError, BagError):
                         frames.append(self._frame(message))
@@ -113,12 +120,16 @@ class FrameReader:
         """T_table_camera of every image, or None, without reading its depths; images that are damaged are left out."""
         poses = []
         with suppress(BagDamage):
-            for message in raw_messages(self.bag):
-                if message.topic == self.depth_topic:
-                    with suppress(BagError):
-                        header = decode(self.bag, message).header
-                        poses.append(self._poses.at(stamp_ns(header), header.frame_id))
+            for message in self._images():
+                with suppress(BagError):
+                    header = decode(self.bag, message).header
+                    poses.append(self._poses.at(stamp_ns(header), header.frame_id))
         return poses
+
+    def _images(self) -> Iterator[RawMessage]:
+        """The messages of the images that are read. Raises BagDamage where the recording cannot be read on."""
+        images = (message for message in raw_messages(self.bag) if message.topic == self.depth_topic)
+        return islice(images, 0, None, self._every)
 
     def _frame(self, message: RawMessage) -> DepthFrame:
         image = decode(self.bag, message)

@@ -170,7 +170,7 @@ class CameraTrackerNode(Node):
         if follower.compiled_for(width, height, self._known):
             return self._parts.health.doing(what, usual=QUIET)
         # Part of it waits until a world is seen, so that this may be said of several frames.
-        told = f"compiling for images of {width}x{height}; a minute or two the first time"
+        told = f"compiling for images of {width}x{height}; some minutes the first time"
         self.get_logger().info(told, throttle_duration_sec=REPEAT)
         return self._parts.health.doing(f"compiling for images of {width}x{height} and {what}")
 

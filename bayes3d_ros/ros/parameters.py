@@ -57,7 +57,7 @@ class DepthInputSettings:
     table_frame: str = setting("table", "name of the table frame in tf: z up, origin on the surface of the table")
     camera_pose: tuple[float, ...] = setting(
         (),
-        "pose of the camera optical frame in table_frame, for a camera that no topic and no tf tells of: x y "
+        "pose of the camera optical frame in table_frame, for a camera whose pose is in no topic and no tf: x y "
         "z qx qy qz qw; empty: none",
     )
     patience: float = setting(
@@ -116,7 +116,7 @@ class SceneParserNodeSettings(DepthInputSettings):
     )
     planning_scene: bool = setting(
         False,
-        "tell a motion planner of the objects on ~/planning_scene, in output_frame, which must stand still; needs "
+        "report the objects to a motion planner on ~/planning_scene, in output_frame, which must stand still; needs "
         "moveit_msgs",
     )
     mode: str = setting(

@@ -340,7 +340,7 @@ class SceneParserNode(Node):
         """Compile for images of a frame's size, where that is needed, and say so."""
         height, width = frame.depth.shape
         if not ready.parser.compiled_for(width, height):
-            self.get_logger().info(f"compiling for images of {width}x{height}; a minute or so the first time")
+            self.get_logger().info(f"compiling for images of {width}x{height}; some minutes the first time")
             with self._parts.health.doing(f"compiling for images of {width}x{height}"):
                 ready.parser.warm_up(width, height)
 

@@ -98,12 +98,24 @@ def test_parse_writes_every_frame(bag, library, parsers, tmp_path):
     assert [parser.warm for parser in parsers.made] == [[(64, 48)]]  # compiled once, before the first frame
     first, compiling, compiled, frame, note, *others, last = result.stdout.splitlines()
     assert first == f"{bag}: 3 depth images of /depth/image_rect, CameraInfo of /depth/camera_info, no camera pose"
-    assert compiling == "compiling, about a minute the first time ..."
-    assert re.fullmatch(r"compiling, about a minute the first time: ready after \d+ s", compiled)
+    assert compiling == "compiling, some minutes the first time ..."
+    assert re.fullmatch(r"compiling, some minutes the first time: ready after \d+ s", compiled)
     objects = "block p(exists) 0.86 p(type) 1.00, slab p(exists) 0.86 p(type) 1.00"
     assert (frame, note) == (f"1  0.25 s  {objects}", "1  note: made up")
     assert others == [f"{stamp}  0.25 s  {objects}" for stamp in (2, 3)]  # their note is the same
     assert last == f"3 frames parsed; results in {out}" and not result.stderr
+
+
+@pytest.mark.parametrize(("every", "stamps"), [(1, [1, 2, 3]), (2, [1, 3]), (3, [1]), (100, [1])])
+def test_parse_takes_every_nth_image(bag, library, parsers, tmp_path, every, stamps):
+    out = tmp_path / "out"
+    result = run("parse", bag, "--library", library, "--out", out, "--every", every)
+    assert result.exit_code == 0, result.output
+    assert [json.loads(text)["stamp_ns"] for text in (out / "scenes.jsonl").read_text().splitlines()] == stamps
+    first, *_, last = result.stdout.splitlines()
+    count = f"{len(stamps)} depth image{'s' * (len(stamps) != 1)} of /depth/image_rect"
+    assert first.startswith(f"{bag}: {count}" + (f" (1 of every {every}), " if every > 1 else ", "))
+    assert last.startswith(f"{len(stamps)} frame{'s' * (len(stamps) != 1)} parsed; ")
 
 
 def test_errors_of_recorded_camera_poses_widen_what_is_told_on_the_table(bag, library, parsers, tmp_path):
@@ -210,6 +222,8 @@ def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers,
         (["--set", "sigma_max=nan"], "sigma_max must lie in"),
         (["--max-objects", "-1"], "max_objects must lie in"),
         (["--particles", "many"], "--particles"),
+        (["--every", "0"], "--every"),
+        (["--every", "half"], "--every"),
         (["--nonsense"], "--nonsense"),
         (["--table", "wood"], "'auto', 'pose', 'depth'"),
         (["too", "much"], "unexpected extra arguments"),
@@ -531,8 +545,8 @@ def test_track_writes_a_line_a_frame_and_a_picture(bag, library, followers, tmp_
     first, around, beginning, ready, *_ = result.stdout.splitlines()
     assert first == f"{bag}: 3 depth images of /depth/image_rect, CameraInfo of /depth/camera_info, no camera pose"
     assert around == "following the camera around what its first frame shows"
-    assert beginning == "first frame: compiling, about a minute the first time ..."
-    assert ready.startswith("first frame: compiling, about a minute the first time: ready after ")
+    assert beginning == "first frame: compiling, some minutes the first time ..."
+    assert ready.startswith("first frame: compiling, some minutes the first time: ready after ")
     assert "lost: out of sight" in result.stdout and "3 frames tracked, lost in 1" in result.stdout
     assert (out / "track.png").stat().st_size > 10_000
 
@@ -576,6 +590,15 @@ def test_mcap_writes_what_the_node_would_publish(bag, library, followers, tmp_pa
     name = {"parse": "/scene_parser/poses", "track": "/camera_tracker/camera_pose"}[command]
     told = topics(file)
     assert told[name].count == told["/tf"].count == 3
+
+
+def test_mcap_holds_the_images_that_were_parsed(bag, library, parsers, tmp_path):
+    pytest.importorskip("rclpy")
+    file, out = tmp_path / "told.mcap", tmp_path / "out"
+    result = run("parse", bag, "--library", library, "--out", out, "--mcap", file, "--every", 2)
+    assert result.exit_code == 0, result.output
+    assert [frame.stamp_ns for frame in read_frames(file)] == [1, 3]
+    assert topics(file)["/scene_parser/poses"].count == 2
 
 
 def test_mcap_without_ros_or_with_a_wrong_name_is_one_line_before_anything_is_read(

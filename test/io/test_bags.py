@@ -43,6 +43,21 @@ def test_round_trip(tmp_path, encoding, with_pose):
                 assert_same(a, b)
 
 
+def test_every_nth_frame(tmp_path):
+    frames = [frame(i, pose=True) for i in range(5)]
+    with BagWriter(tmp_path / "bag") as writer:
+        for f in frames:
+            writer.write(f)
+    for every in (1, 2, 3, 5, 6):
+        reader, wanted = read_frames(tmp_path / "bag", every=every), frames[::every]
+        assert len(reader) == len(reader.camera_poses()) == len(wanted)
+        for read in (reader, reader.spread(len(wanted))):
+            for a, b in zip(read, wanted, strict=True):
+                assert_same(a, b)
+    with pytest.raises(ValueError, match="every must be 1 or more, got 0"):
+        read_frames(tmp_path / "bag", every=0)
+
+
 def test_raw_messages_and_topics(bag):
     messages = list(raw_messages(bag))
     assert [m.t_ns for m in messages] == sorted(m.t_ns for m in messages)
