@@ -135,7 +135,7 @@ def test_a_bad_value_at_the_start_is_named_in_one_line_and_the_node_lives(
 
 @pytest.mark.parametrize(
     "declared",
-    [with_values("types:=[mug, bowl]", "region:=[0, 0.2, -1, 0.3]"), with_values("types:=[]")],
+    [with_values("types:=[mug, bowl]", "region:=[0.0, 0.2, -1.0, 0.3]"), with_values("types:=[]")],
     indirect=True,
 )
 def test_lists_may_be_of_names_and_of_numbers(declared: tuple[Node, SettingsParameters]) -> None:
