@@ -4,8 +4,8 @@
 in a folder, parsed with models from YCB meshes, and with models that are learned from one view each.
 
 Where a bag has a `ground_truth.json`, what is listed is held against it: an object of the library is right where it is
-found, and anything else that stands there is right where it is told as unknown. Nothing is tuned on a recording: the
-settings are those of `bayes3d parse`.
+found, and anything else that stands there is right where it is told as unknown. The settings are those of `bayes3d
+parse`.
 """
 
 from collections.abc import Callable, Iterator

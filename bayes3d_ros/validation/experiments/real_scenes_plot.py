@@ -22,7 +22,7 @@ from bayes3d_ros.validation.experiments.plot_style import GREY, save_both
 
 SCENES_OF_A_FIGURE = 6
 SHOWN = 9  # objects that are named beside a scene
-_DEPTHS = (0.02, 0.98)  # quantiles of the returns, between which colours tell depths apart
+_DEPTHS = (0.01, 0.99)  # quantiles of the reconstruction's depths, between which colours tell depths apart
 
 
 class KeptObject(NamedTuple):
@@ -65,7 +65,7 @@ def _figure(rows: Sequence[Row], folder: Path) -> Figure:
     axes = figure.subplots(len(rows), 4, squeeze=False, width_ratios=(1, 1, 1, 1.15))
     for k, (row, line) in enumerate(zip(rows, axes, strict=True)):
         scene = _kept(row, folder)
-        depths = scene.depth[np.isfinite(scene.depth)]
+        depths = scene.reconstruction[np.isfinite(scene.reconstruction)]  # not those of a room behind the table
         scale = Normalize(*(np.quantile(depths, _DEPTHS) if len(depths) else (0.0, 1.0)))
         depth_panel(line[0], scene.depth, scale, "" if k else "observed depth")
         depth_panel(line[1], scene.reconstruction, scale, "" if k else "reconstruction")
