@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from bayes3d_ros.objects.library_arrays import EMPTY, NUM_FACES, LibraryArrays
 
@@ -64,7 +64,7 @@ def left_out(placement: Placement, library: LibraryArrays, table: Table) -> Bool
 
 
 def room(
-    type_id: Int[Array, "*batch"], face: Int[Array, "*batch"], library: LibraryArrays, table: Table
+    type_id: Int[ArrayLike, "*batch"], face: Int[ArrayLike, "*batch"], library: LibraryArrays, table: Table
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2"]]:
     """The least and the greatest x and y, metres, that the prior allows an object's box centre: the table's rectangle
     shrunk by the face's width and height, and of it what lies in the region. It is never narrower than LEAST_ROOM:

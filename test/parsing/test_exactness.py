@@ -195,7 +195,7 @@ def restricted_to(problem, found, type_id, left):
     share = np.clip((x + width / 2 - left) / width, 0, 1)
     size = np.asarray(context.library.face_size)[type_id, np.asarray(cells.placement.face)[here], 0]
     free = problem.table_size[0] - size
-    denser = np.log(len(problem.library.models) * free / (free / 2 - left))
+    denser = np.log(len(problem.library.models) * free / (free / 2 - np.maximum(left, -free / 2)))
     with np.errstate(divide="ignore"):
         return float(logsumexp(cells.log_mass[here] + np.log(share) + denser)), x, cells.log_mass[here]
 
