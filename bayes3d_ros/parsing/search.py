@@ -267,19 +267,44 @@ def _types_first(
 def _with_turns(
     modes: Hypotheses, value: Float[Array, "N"], gains: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, "N2"]]:
-    """These hypotheses, and of the best one of each of `turned_types` types those of its turns that gain most. Both are
-    sorted by falling gain."""
+    """These hypotheses, and the turns of the best ones that gain most (`_best_turns`). Both are sorted by falling
+    gain."""
+    turns, gained = _best_turns(modes, value, gains, library)
+    return _together(modes, value, turns, gained)
+
+
+def _turned_again(
+    key: PRNGKeyArray, modes: Hypotheses, value: Float[Array, "N"], gains: Gains, library: LibraryArrays
+) -> tuple[Hypotheses, Float[Array, "N2"]]:
+    """The same by the model itself, which tells yaws apart that look alike pixel by pixel. The turns are followed
+    uphill."""
+    turns, _ = _best_turns(modes, value, gains, library)
+    turns, gained = narrow(key, widened(turns), gains, SEARCH.shared_draws, SEARCH.turned_rounds)
+    return _together(modes, value, turns, gained)
+
+
+def _together(
+    modes: Hypotheses, value: Float[Array, "N"], others: Hypotheses, of_others: Float[Array, "M"]
+) -> tuple[Hypotheses, Float[Array, "NM"]]:
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), modes, others)
+    value = jnp.concatenate([value, of_others])
+    return best_first(both, value, len(value))
+
+
+def _best_turns(
+    modes: Hypotheses, value: Float[Array, "N"], gains: Gains, library: LibraryArrays
+) -> tuple[Hypotheses, Float[Array, "M"]]:
+    """The best hypothesis of each of `turned_types` types is turned all around; of each, the `turns_kept` peaks that
+    gain most, and what they gain."""
     types = min(SEARCH.turned_types, len(value))
     first = _best_of_types(modes.placement.type, value, 1, types)
     source, _ = best_first(modes, jnp.where(first, value, -jnp.inf), types)
     copies = turned(source, library)
     gained = gains(copies.placement).reshape(types, TURNED)
     peak = (gained >= jnp.roll(gained, 1, 1)) & (gained >= jnp.roll(gained, -1, 1))
+    peak &= jnp.arange(TURNED) > 0  # the first is the hypothesis itself
     best, turn = jax.lax.top_k(jnp.where(peak, gained, -jnp.inf), SEARCH.turns_kept)
-    index = (turn + TURNED * jnp.arange(types)[:, None]).ravel()
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b[index]]), modes, copies)
-    value = jnp.concatenate([value, best.ravel()])
-    return best_first(both, value, len(value))
+    return take(copies, (turn + TURNED * jnp.arange(types)[:, None]).ravel()), best.ravel()
 
 
 def _searched(
@@ -307,7 +332,9 @@ def _searched(
         # millimetres off where pixels alone have it: the model itself follows the modes, and chooses.
         modes, _ = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.shared_rough_rounds)
         itself = _marginal_gains(model, scene.loglik_grid, scene, context, window)
-        modes, value = narrow(model_key, widened(modes), itself, SEARCH.shared_draws, SEARCH.shared_rounds)
+        follow_key, turn_key = jax.random.split(model_key)
+        modes, value = narrow(follow_key, widened(modes), itself, SEARCH.shared_draws, SEARCH.shared_rounds)
+        modes, value = _turned_again(turn_key, modes, value, itself, library)
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
     modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)

@@ -52,6 +52,7 @@ class SearchTuning(NamedTuple):
     # missed at its yaw, by 60 nats, with two seeds of four.
     turned_types: int = 6
     turns_kept: int = 2
+    turned_rounds: int = 3  # in which these are followed by a model of shared errors
     starts_apart: tuple[float, float] = (0.004, 0.05)  # m, rad: as candidates_apart; not recorded
     repeated_nats: float = (
         4.0  # subtracted for each better pose of the type at a place; mug or cup, two bricks (exactness)
