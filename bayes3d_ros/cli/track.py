@@ -98,7 +98,7 @@ def track(
     lost = sum(bool(estimate.lost) for estimate in estimates)
     summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
     summary += f", {failed} could not be" if failed else ""
-    title, by_name = f"{bag.name}   {frames.depth_topic}   {summary}", {model.name: model for model in models.models}
+    title, by_name = f"{bag.name}   {frames.depth_topic}   {summary}", models.by_name
     plot_track(estimates, out / PICTURE_FILE, title, recorded, world_seen, by_name, settings.least_explained)
     click.echo(f"{summary}; results in {out}" + (f" and {mcap}" if mcap else ""))
 

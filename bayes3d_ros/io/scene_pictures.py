@@ -30,7 +30,7 @@ class ScenePictures:
         camera_pose_sigma: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self._title = f"{frames.bag.name}   {frames.depth_topic}"
-        self._models = {model.name: model for model in library.models}
+        self._models = library.by_name
         self._view = CommonView(frames.camera_poses(), area)
         self._history = SceneHistory(camera_pose_sigma)
         self._summary = summary

@@ -125,6 +125,11 @@ class Library:
     def names(self) -> tuple[str, ...]:
         return tuple(m.name for m in self.models)
 
+    @property
+    def by_name(self) -> dict[str, ObjectModel]:
+        """The models by their names."""
+        return {m.name: m for m in self.models}
+
 
 def check_types(types: Sequence[str], library: Library) -> None:
     """Raise ValueError, in one line, where a library holds no type of one of these names."""

@@ -67,7 +67,7 @@ def self_symmetry(
             shift = np.concatenate([middle[face] - turned, turn[:, None]], 1)
             shift, error = _slid(shift, resting[other], T, surface)
             if other == face:
-                found.turned[face] = _kept_in_place(shift[:: _TURNS // TURNED], resting[face], T, surface)
+                found.turned[face], _ = _slid_on(shift[:: _TURNS // TURNED], resting[face], T, surface)
             lowest = (error <= np.roll(error, 1)) & (error <= np.roll(error, -1)) & (error < 2 * _ALIKE_WITHIN)
             shift, error = shift[lowest], error[lowest]
             for halving in range(_YAW_HALVINGS if len(shift) else 0):
@@ -76,8 +76,8 @@ def self_symmetry(
                 tried, errors = (a.reshape(3, len(shift), -1) for a in _slid(tried, resting[other], T, surface))
                 pick = errors[..., 0].argmin(0), np.arange(len(shift))
                 shift, error = tried[pick], errors[..., 0][pick]
-            for _ in range(_SLIDES if len(shift) else 0):
-                shift, error = _slid(shift, resting[other], T, surface)
+            if len(shift):
+                shift, error = _slid_on(shift, resting[other], T, surface)
             square = _squared(shift, T, T_contact_object[other], centre)
             squared = _slid(square, resting[other], T, surface)[1] if len(shift) else error
             shift = np.where((squared < error + _AS_GOOD)[:, None], square, shift)
@@ -99,18 +99,6 @@ def self_symmetry(
 def _nothing_alike(faces: int) -> SelfSymmetry:
     alike = np.tile(np.arange(faces)[:, None], (1, ALIKE))
     return SelfSymmetry(alike, np.zeros((faces, ALIKE, 3)), np.zeros((faces, TURNED, 3)))
-
-
-def _kept_in_place(
-    shift: Float[np.ndarray, "T 3"],
-    points: Float[np.ndarray, "P 3"],
-    T_contact_object: Float[np.ndarray, "4 4"],
-    surface: _Surface,
-) -> Float[np.ndarray, "T 3"]:
-    """Turns, slid along the table to where the surface lies on itself best."""
-    for _ in range(_SLIDES):
-        shift, _ = _slid(shift, points, T_contact_object, surface)
-    return shift
 
 
 def _reversible(found: SelfSymmetry) -> SelfSymmetry:
@@ -199,3 +187,15 @@ def _slid(
     square = np.einsum("tpa,tpb->tab", normal, normal) + 0.5 * np.eye(2)
     slide = np.linalg.solve(square, (normal * off[..., None]).sum(1)[..., None])[..., 0]
     return shift + np.concatenate([slide, np.zeros((len(shift), 1))], 1), error
+
+
+def _slid_on(
+    shift: Float[np.ndarray, "T 3"],
+    points: Float[np.ndarray, "P 3"],
+    T_contact_object: Float[np.ndarray, "4 4"],
+    surface: _Surface,
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T"]]:
+    """`_SLIDES` rounds of `_slid`: to where the points lie on the surface best, and how far off before the last."""
+    for _ in range(_SLIDES):
+        shift, error = _slid(shift, points, T_contact_object, surface)
+    return shift, error

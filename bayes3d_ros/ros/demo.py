@@ -136,7 +136,7 @@ def run_demo(out: Path, say: Callable[[str], None]) -> None:
     for note in posterior.notes:
         say(f"note: {note}")
     title, camera = f"{bag.name}   as published   stamp {frame.stamp_ns}", frame.intrinsics
-    models = {model.name: model for model in library.models}
+    models = library.by_name
     view = CommonView(reader.camera_poses()).of(posterior, camera)  # the ranges that `bayes3d parse` shows
     picture = plot_scene(frame.depth, posterior, out / "scene.png", title, camera, models, view)
     say(f"every output arrived; picture: {picture}")

@@ -282,6 +282,6 @@ def _check_known(told: Told, bag: Path, frame: DepthFrame, library: Path) -> Non
 def _picture(told: Told, table: DemoTable, k: int, path: Path, title: str) -> Path:
     """Of frame k; both pictures have the same ranges."""
     frame = table.frames[k]
-    models = {model.name: model for model in load_library(table.library).models}
+    models = load_library(table.library).by_name
     view = CommonView([frame.T_table_camera for frame in table.frames]).of(told.posterior, frame.intrinsics)
     return plot_scene(frame.depth, told.posterior, path, title, frame.intrinsics, models, view)

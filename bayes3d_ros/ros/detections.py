@@ -26,7 +26,7 @@ def detection_array(posterior: ScenePosterior, library: Library, ids: Sequence[s
     """A detection per object, by its id; without `ids` by its label. Its results are one hypothesis per type and mode
     of the pose given that type, with the mode's pose and covariance and the score p(exists) p(type) p(mode), by which
     they are sorted."""
-    models = {model.name: model for model in library.models}
+    models = library.by_name
     array = vision.Detection3DArray(header=header(posterior))
     for label, estimate in enumerate(posterior.objects, start=1):
         modes = told_modes(posterior, label - 1)

@@ -23,7 +23,7 @@ class SceneMarkers:
     """Makes marker arrays for the objects of one library."""
 
     def __init__(self, library: Library) -> None:
-        self._models = {model.name: model for model in library.models}
+        self._models = library.by_name
         self._voxels = {model.name: _voxel_points(model) for model in library.models}
 
     def __call__(self, posterior: ScenePosterior, ids: Sequence[str] = ()) -> MarkerArray:

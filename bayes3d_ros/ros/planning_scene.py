@@ -47,7 +47,7 @@ class CollisionMeshes:
     """Meshes of a library's models, each made when it is first needed."""
 
     def __init__(self, library: Library) -> None:
-        self._models: Mapping[str, ObjectModel] = {model.name: model for model in library.models}
+        self._models: Mapping[str, ObjectModel] = library.by_name
         self._made: dict[str, Mesh] = {}
 
     def __getitem__(self, name: str) -> Mesh:

@@ -83,7 +83,7 @@ class YcbWorld:
     settings: ParserSettings = field(default_factory=ParserSettings)
 
     def __post_init__(self) -> None:
-        self.models = {model.name: model for model in self.library.models}
+        self.models = self.library.by_name
         self.known: Callable[[str], RestingObject] = cache(self._known)
         self.foreign: Callable[[str], RestingObject] = cache(_foreign)
         self.parser: Callable[[], SceneParser] = cache(self._parser)

@@ -177,7 +177,7 @@ def failed_rows(where: Row, true: Sequence[TrueObject], error: str) -> list[Row]
 
 def _partners(true: Sequence[TrueObject], estimates: Sequence[ObjectEstimate], library: Library) -> dict[int, int]:
     """Index of the estimate that stands for a true object, of the same type."""
-    models = {model.name: model for model in library.models}
+    models = library.by_name
     here = np.array([(estimated_pose(e) @ e.box(models)[0])[:3, 3] for e in estimates]).reshape(-1, 3)
     there = np.zeros((len(true), 3))
     for i, thing in enumerate(true):

@@ -138,7 +138,7 @@ class RealScenes:
         }
         write_whole(path, lambda file: np.savez_compressed(file, **images))
         title = f"{job.scene.name}   frame {job.number}   models: {job.models}"
-        by_type = {model.name: model for model in models.library.models}
+        by_type = models.library.by_name
         save_both(scene_figure(job.frame.depth, posterior, title, job.frame.intrinsics, by_type), path)
         return name
 
