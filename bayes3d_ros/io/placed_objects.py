@@ -64,7 +64,7 @@ def placed_candidates(
 ) -> tuple[PlacedCandidate, ...]:
     """Objects that are not listed, with p(exists) of LEAST_SHOWN or more; the origins of their frames."""
     samples, index = posterior.samples, posterior.object_index
-    weights = _weights(posterior)
+    weights = posterior.samples.weight
     found = []
     for k in np.unique(index[index >= len(posterior.objects)]):
         sample, slot = np.nonzero(index == k)
@@ -73,12 +73,6 @@ def placed_candidates(
             place = weights[sample] @ samples.position[sample, slot] / weights[sample].sum()
             found.append(PlacedCandidate(share, (T_table_camera[:3, :3] @ place + T_table_camera[:3, 3])[:2]))
     return tuple(found)
-
-
-def _weights(posterior: ScenePosterior) -> Float[np.ndarray, "S"]:
-    log_weight = posterior.samples.log_weight.astype(float)
-    weights = np.exp(log_weight - log_weight.max(initial=-np.inf))
-    return weights / max(weights.sum(), 1e-300)
 
 
 def _placed_modes(told: ScenePosterior, k: int, models: Mapping[str, ObjectModel]) -> tuple[PlacedMode, ...]:
@@ -102,7 +96,7 @@ def _centre_spreads(
     sample, slot = np.nonzero((told.object_index == k) & (samples.type == kind))
     if not len(sample):
         return []
-    weights = _weights(told)[sample]
+    weights = told.samples.weight[sample]
     position, quaternion = samples.position[sample, slot].astype(float), samples.orientation[sample, slot].astype(float)
     quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
     label = mode_labels(position, quaternion, weights, samples.face[sample, slot])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.image_model import ImageModel, gain, likeliest_noise, log_marginal
@@ -47,12 +47,10 @@ from bayes3d_ros.parsing.mode_search import (
     with_self_symmetry,
 )
 from bayes3d_ros.parsing.neighbour_depth import neighbour_depth
-from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, wrap
+from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density
+from bayes3d_ros.parsing.selection import CROWDED_OUT_NATS, best_of_types, distinct, together, types_first
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.tempering import exponents
-
-_CROWDED_OUT_NATS = 1e6  # more than any two gains differ by: hypotheses lowered by this come last
-
 
 Gains = Callable[[Placement], Float[Array, "N"]]  # log likelihoods that objects [N] gain
 
@@ -99,41 +97,6 @@ def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], 
     return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(placement.type.shape)) > limit
 
 
-def _distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
-    """Scores, with -inf for near-copies of a better hypothesis. Hypotheses are sorted by falling score."""
-    same = (placement.type[:, None] == placement.type) & (placement.face[:, None] == placement.face)
-    close = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y) < near[0]
-    close &= jnp.abs(wrap(placement.yaw[:, None] - placement.yaw)) < near[1]
-    better = jnp.tril(same & close, -1)
-    return jnp.where(better.any(1), -jnp.inf, score)
-
-
-def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArrays, most: int) -> Float[Array, "N"]:
-    """Scores, lowered for all but the `most` best hypotheses of a place, which come after all others.
-
-    Within a place, each hypothesis is also lowered by `repeated_nats` for every better one of its type. So what is
-    seen best crowds out neither objects elsewhere nor another type of a few per cent. Hypotheses are sorted by
-    falling score.
-    """
-    apart = jnp.hypot(placement.x[:, None] - placement.x, placement.y[:, None] - placement.y)
-    close = apart < library.radius[placement.type]
-    before = jnp.tril(close & jnp.isfinite(score), -1)
-    same = before & (placement.type[:, None] == placement.type)
-    score = score - SEARCH.repeated_nats * same.sum(1)
-    return jnp.where(before.sum(1) < most, score, score - _CROWDED_OUT_NATS)
-
-
-def _best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int, most_types: int) -> Bool[Array, "N"]:
-    """Which hypotheses are among the `each` best of their type, for the `most_types` types with the best best
-    hypothesis. A few returns may belong to any type, and many poses of one type must not crowd out the others."""
-    better = (score[:, None] < score) | ((score[:, None] == score) & jnp.tril(jnp.ones((len(score),) * 2, bool), -1))
-    same = type_id[:, None] == type_id
-    best_of_type = ~(better & same).any(1)
-    types_before = (better & best_of_type).sum(1)  # of a type's best: how many other types are better
-    rank_of_type = jnp.where(same & best_of_type, types_before, 0).sum(1)
-    return jnp.isfinite(score) & ((better & same).sum(1) < each) & (rank_of_type < most_types)
-
-
 def candidates(
     scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int], overlap_limit: float
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
@@ -173,9 +136,9 @@ def candidates(
     others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
     clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    score = _distinct(found.placement, score, SEARCH.candidates_apart)
-    first = _best_of_types(found.placement.type, score, SEARCH.candidates_a_type, types)
-    return best_first(found, score + jnp.where(first, _CROWDED_OUT_NATS, 0.0), min(SEARCH.candidates, len(score)))
+    score = distinct(found.placement, score, SEARCH.candidates_apart)
+    first = best_of_types(found.placement.type, score, SEARCH.candidates_a_type, types)
+    return best_first(found, score + jnp.where(first, CROWDED_OUT_NATS, 0.0), min(SEARCH.candidates, len(score)))
 
 
 def _gains(
@@ -240,28 +203,10 @@ def _starts(
 ) -> tuple[Hypotheses, Float[Array, ""]]:
     """The hypotheses to follow uphill for a little, and the gain of the best one."""
     found, gain = best_first(found, jnp.where(jnp.isfinite(score), rough(found.placement), -jnp.inf), len(score))
-    chosen = _types_first(
+    chosen = types_first(
         found, gain, SEARCH.starts_apart, (SEARCH.early_a_type, SEARCH.start_types), SEARCH.starts, library
     )
     return chosen, gain[0]
-
-
-def _types_first(
-    modes: Hypotheses,
-    value: Float[Array, "N"],
-    near: tuple[float, float],
-    of_types: tuple[int, int],
-    others: int,
-    library: LibraryArrays,
-) -> Hypotheses:
-    """The best `each` of `types` types, those with the best best hypothesis, and `others` more of any type. near:
-    metres and radians within which two hypotheses of a type and face are copies. Hypotheses are sorted by falling
-    value."""
-    each, types = of_types
-    value = _distinct(modes.placement, value, near)
-    first = _best_of_types(modes.placement.type, value, each, types)
-    value = _apart(modes.placement, value, library, others * 3 // 4)
-    return best_first(modes, value + jnp.where(first, _CROWDED_OUT_NATS, 0.0), others + each * types)[0]
 
 
 def _with_turns(
@@ -270,7 +215,7 @@ def _with_turns(
     """These hypotheses, and the turns of the best ones that gain most (`_best_turns`). Both are sorted by falling
     gain."""
     turns, gained = _best_turns(modes, value, gains, library)
-    return _together(modes, value, turns, gained)
+    return together(modes, value, turns, gained)
 
 
 def _turned_again(
@@ -280,15 +225,7 @@ def _turned_again(
     uphill."""
     turns, _ = _best_turns(modes, value, gains, library)
     turns, gained = narrow(key, widened(turns), gains, SEARCH.shared_draws, SEARCH.turned_rounds)
-    return _together(modes, value, turns, gained)
-
-
-def _together(
-    modes: Hypotheses, value: Float[Array, "N"], others: Hypotheses, of_others: Float[Array, "M"]
-) -> tuple[Hypotheses, Float[Array, "NM"]]:
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), modes, others)
-    value = jnp.concatenate([value, of_others])
-    return best_first(both, value, len(value))
+    return together(modes, value, turns, gained)
 
 
 def _best_turns(
@@ -297,7 +234,7 @@ def _best_turns(
     """The best hypothesis of each of `turned_types` types is turned all around; of each, the `turns_kept` peaks that
     gain most, and what they gain."""
     types = min(SEARCH.turned_types, len(value))
-    first = _best_of_types(modes.placement.type, value, 1, types)
+    first = best_of_types(modes.placement.type, value, 1, types)
     source, _ = best_first(modes, jnp.where(first, value, -jnp.inf), types)
     copies = turned(source, library)
     gained = gains(copies.placement).reshape(types, TURNED)
@@ -324,7 +261,7 @@ def _searched(
     modes, value = narrow(early_key, found, rough, SEARCH.early_draws, SEARCH.early_rounds)
     modes, value = best_first(modes, value, len(value))
     modes, value = _with_turns(modes, value, rough, library)
-    modes = _types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
+    modes = types_first(modes, value, SEARCH.starts_apart, (1, SEARCH.start_types), SEARCH.starts, library)
     if isinstance(model, NoiseGrid):
         modes, value = narrow(narrow_key, modes, rough, SEARCH.narrow_draws, SEARCH.narrow_rounds)
     else:
@@ -337,7 +274,7 @@ def _searched(
         modes, value = _turned_again(turn_key, modes, value, itself, library)
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
-    modes = _types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
+    modes = types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
     exact, marginal = _targets(take(modes.placement, slice(1)), scene, context, model, window)
     rounds = SEARCH.fit_rounds if isinstance(model, NoiseGrid) else SEARCH.shared_fit_rounds
     modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, rounds)

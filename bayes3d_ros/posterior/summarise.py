@@ -59,8 +59,7 @@ def summarise(
         raise ValueError("a posterior needs at least one sample")
     if samples.type.size and samples.type.max() >= len(types):
         raise ValueError(f"samples hold type {samples.type.max()}, there are {len(types)} types")
-    weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
-    weights /= weights.sum()
+    weights = samples.weight
     centre, radius = _centres(samples, library)
 
     index = same_objects(centre, samples.type, weights, _most_probable_count(samples, weights), radius)
@@ -106,8 +105,7 @@ def object_estimates(
     samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], count: int
 ) -> tuple[ObjectEstimate, ...]:
     """What the samples say about objects 0 .. count - 1, given the object in every slot."""
-    weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
-    weights /= weights.sum()
+    weights = samples.weight
     return tuple(_estimate(samples, weights, object_index == k, types) for k in range(count))
 
 
@@ -115,7 +113,7 @@ def modes_by_type(
     samples: SceneSamples, object_index: Int[np.ndarray, "S M"], types: tuple[str, ...], k: int
 ) -> dict[str, tuple[PoseMode, ...]]:
     """Modes of object k's pose, for each type that any sample gives it; poses are those of the type's own frame."""
-    weights = np.exp(samples.log_weight.astype(float) - samples.log_weight.max())
+    weights = samples.weight
     held = np.where(object_index == k, samples.type, -1)
     return {types[t]: _pose(samples, weights, held == t).modes for t in np.unique(held[held >= 0]).tolist()}
 

@@ -34,6 +34,14 @@ class SceneSamples(NamedTuple):
     # Which independent draw of the sampler an object descends from, by copies and small moves; None: not known.
     draw: Int[np.ndarray, "S M"] | None = None
 
+    @property
+    def weight(self) -> Float[np.ndarray, "S"]:
+        """The samples' weights in float64, with a sum of one also where `log_weight` was rounded or only part of the
+        samples is here."""
+        log_weight = self.log_weight.astype(np.float64)
+        weight = np.exp(log_weight - log_weight.max(initial=-np.inf))
+        return weight / max(weight.sum(), np.finfo(float).tiny)
+
 
 class PoseMode(NamedTuple):
     """One possible pose of an object: a peak of the density of its poses, with all samples that belong to the peak."""

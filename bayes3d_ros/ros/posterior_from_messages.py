@@ -86,7 +86,7 @@ def posterior_from_messages(messages: dict[str, Any], library: Library) -> Scene
     cloud, depth = messages["posterior"], messages["depth_reconstruction"]
     samples, object_index = samples_from_rows(rows_from_cloud(cloud))
     samples = moved_samples(samples, _T_camera_pose(messages))
-    weights = np.exp(samples.log_weight.astype(float))
+    weights = samples.weight
     scene, *told = messages["summary"].status
     values = {pair.key: pair.value for pair in scene.values}
     types = (*library.names, UNKNOWN) if "p n unknown" in values else library.names

@@ -148,7 +148,7 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
     if not near or min(near)[0] > SAME_THING_WITHIN:
         return {}
     sample, slot = np.nonzero(posterior.object_index == min(near)[1])
-    weights = np.exp(samples.log_weight[sample].astype(float))
+    weights = samples.weight[sample]
     total = weights.sum()
     weights /= total
     turned = to_table @ Rotation.from_quat(samples.orientation[sample, slot]).as_matrix()

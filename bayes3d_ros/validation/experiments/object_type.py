@@ -173,7 +173,7 @@ def _row(method: str, size: int, kind: str, p: Float[np.ndarray, "N"], seen: Occ
 def hammer_probability(samples: SceneSamples, library: Library) -> float:
     """p(hammer | one box and one other thing); 1/2 where no sample is of that."""
     box, *things = (library.names.index(name) for name in (OCCLUDER, *HIDDEN))
-    weight = np.exp(samples.log_weight.astype(float))
+    weight = samples.weight
     pairs = np.sort(samples.type[:, :2], 1)
     hammer, dumbbell = (weight[(pairs == np.sort([box, thing])).all(1)].sum() for thing in things)
     return float(hammer / (hammer + dumbbell)) if hammer + dumbbell > 0 else 0.5

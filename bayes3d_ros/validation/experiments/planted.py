@@ -117,8 +117,7 @@ def scene_row(planted: PlantedScene, parser: SceneParser, library: LibraryArrays
         return row | {"error": str(error)}
     truth, _ = placement_of(type_id, scene.T_table_object, library)
     about_truth = planted_evidence(jax.random.key(seed), seen, library, parser.settings, truth)
-    weight = np.exp(posterior.samples.log_weight.astype(float))
-    p_type = np.bincount(posterior.samples.type[:, 0], weight, minlength=len(parser.library.names))
+    p_type = np.bincount(posterior.samples.type[:, 0], posterior.samples.weight, minlength=len(parser.library.names))
     said = int(p_type.argmax())
     return row | {
         "log_evidence": round(posterior.log_evidence, 4),

@@ -102,7 +102,7 @@ def position_moments(run: ScenePosterior, k: int) -> tuple[Float[np.ndarray, "3"
     """Posterior mean and standard deviations of the position of the k-th object listed, given its type."""
     samples = run.samples
     own = (run.object_index == k) & (samples.type == run.types.index(run.objects[k].type))
-    weight = np.where(own, np.exp(samples.log_weight.astype(np.float64))[:, None], 0.0)
+    weight = np.where(own, samples.weight[:, None], 0.0)
     weight /= weight.sum()
     mean = np.einsum("sm,sma->a", weight, samples.position)
     return mean, np.sqrt(np.einsum("sm,sma->a", weight, (samples.position - mean) ** 2))

@@ -37,7 +37,7 @@ def weighted_yaws(
     object that lies it is that of the turn about the vertical nearest to its orientation."""
     there = samples.num_objects > 0
     R = T_table_camera[:3, :3] @ Rotation.from_quat(samples.orientation[there, 0]).as_matrix()
-    weight = np.exp(samples.log_weight[there].astype(float))
+    weight = samples.weight[there]
     return np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]), weight / weight.sum()
 
 
