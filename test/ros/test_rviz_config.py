@@ -50,7 +50,7 @@ def test_every_topic_is_one_of_the_node(ros, library_folder, namespace: str, nam
     ros.start_parser(library_folder, "--ros-args", *(word for rule in remap for word in ("-r", rule)))
     ros.node.create_publisher(Image, depth, 1)
     wanted = topics(rviz_config(f"{namespace}/{name}", depth, "camera"))
-    assert len(wanted) == 6
+    assert len(wanted) == 7
 
     def present() -> dict[str, list[str]] | None:
         there = dict(ros.node.get_topic_names_and_types())
