@@ -34,7 +34,7 @@ from bayes3d_ros.settings import LearnerSettings
     type=click.IntRange(1, 10),
     default=10,
     show_default=True,
-    help="Largest number of frames to use; they are chosen so that the directions of view differ.",
+    help="Largest number of frames to use; they are chosen so that the camera's positions lie far apart.",
 )
 @click.option(
     "--cluster",
