@@ -48,7 +48,7 @@ from bayes3d_ros.parsing.mode_search import (
 )
 from bayes3d_ros.parsing.neighbour_depth import neighbour_depth
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density
-from bayes3d_ros.parsing.selection import CROWDED_OUT_NATS, best_of_types, distinct, together, types_first
+from bayes3d_ros.parsing.selection import best_of_types, chosen_first, distinct, together, types_first
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.tempering import exponents
 
@@ -138,7 +138,7 @@ def candidates(
     found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
     score = distinct(found.placement, score, SEARCH.candidates_apart)
     first = best_of_types(found.placement.type, score, SEARCH.candidates_a_type, types)
-    return best_first(found, score + jnp.where(first, CROWDED_OUT_NATS, 0.0), min(SEARCH.candidates, len(score)))
+    return chosen_first(found, score, first, min(SEARCH.candidates, len(score)))
 
 
 def _gains(

@@ -13,7 +13,7 @@ from bayes3d_ros.parsing.mode_search import Hypotheses, best_first
 from bayes3d_ros.parsing.proposal import wrap
 from bayes3d_ros.parsing.tuning import SEARCH
 
-CROWDED_OUT_NATS = 1e6  # more than any two gains differ by: hypotheses lowered by this come last
+_CROWDED_OUT_NATS = 1e6  # more than any two gains differ by: hypotheses lowered by this come last
 
 
 def distinct(placement: Placement, score: Float[Array, "N"], near: tuple[float, float]) -> Float[Array, "N"]:
@@ -37,7 +37,7 @@ def _apart(placement: Placement, score: Float[Array, "N"], library: LibraryArray
     before = jnp.tril(close & jnp.isfinite(score), -1)
     same = before & (placement.type[:, None] == placement.type)
     score = score - SEARCH.repeated_nats * same.sum(1)
-    return jnp.where(before.sum(1) < most, score, score - CROWDED_OUT_NATS)
+    return jnp.where(before.sum(1) < most, score, score - _CROWDED_OUT_NATS)
 
 
 def best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int, most_types: int) -> Bool[Array, "N"]:
@@ -49,6 +49,13 @@ def best_of_types(type_id: Int[Array, "N"], score: Float[Array, "N"], each: int,
     types_before = (better & best_of_type).sum(1)  # of a type's best: how many other types are better
     rank_of_type = jnp.where(same & best_of_type, types_before, 0).sum(1)
     return jnp.isfinite(score) & ((better & same).sum(1) < each) & (rank_of_type < most_types)
+
+
+def chosen_first(
+    found: Hypotheses, score: Float[Array, "N"], chosen: Bool[Array, "N"], count: int
+) -> tuple[Hypotheses, Float[Array, "C"]]:
+    """The `count` best hypotheses, those that are chosen before all others. Scores of the chosen ones are raised."""
+    return best_first(found, score + jnp.where(chosen, _CROWDED_OUT_NATS, 0.0), count)
 
 
 def types_first(
@@ -66,7 +73,7 @@ def types_first(
     value = distinct(modes.placement, value, near)
     first = best_of_types(modes.placement.type, value, each, types)
     value = _apart(modes.placement, value, library, others * 3 // 4)
-    return best_first(modes, value + jnp.where(first, CROWDED_OUT_NATS, 0.0), others + each * types)[0]
+    return chosen_first(modes, value, first, others + each * types)[0]
 
 
 def together(
