@@ -3,12 +3,10 @@
 """The log likelihoods of the blocks of a patch, at every node: cells of the table and of earlier objects as sums, and
 the cells of the new object one by one."""
 
-import numpy as np
-
 from bayes3d_ros.likelihood.cpu.buffers import f32
 from bayes3d_ros.likelihood.cpu.cells import CELLS_SIDE_BY_SIDE, NO_MODE, find_modes, normal_cells, table_cells
-from bayes3d_ros.likelihood.cpu.compiling import strict
-from bayes3d_ros.likelihood.cpu.edges import log_edge
+from bayes3d_ros.likelihood.cpu.compiling import inlined, strict
+from bayes3d_ros.likelihood.cpu.edges import EDGES_SIDE_BY_SIDE, add_edges, put_edge
 from bayes3d_ros.likelihood.cpu.patches import CELL, EDGE, HIDDEN, NEW, OLD, TABLE, UNKNOWN
 from bayes3d_ros.likelihood.cpu.windows import log
 from bayes3d_ros.likelihood.shared_errors import LOST_DEPTH, LOST_SHARE, SEEN_THROUGH, SEEN_THROUGH_NATS
@@ -27,7 +25,7 @@ def _median(residual, used, count, ordered):
     return ordered[middle] if count % 2 else f32(0.5) * (ordered[middle] + ordered[middle - 1])
 
 
-@strict
+@inlined
 def _labels_of_cells(scene, rectangle, stride, left, top):
     """A bit for each label that has a cell in a block."""
     u0, u1, v0, v1 = rectangle
@@ -40,11 +38,12 @@ def _labels_of_cells(scene, rectangle, stride, left, top):
     return bits
 
 
-@strict
+@inlined
 def _gather(
-    picture, returns, space, scene, lost, place_of_sum, rectangle, stride, left, top, label, batch, used, cell_work
-):
-    """Add the cell of one label in a block to the batch."""
+    returns, space, scene, outlier_scale, lost, number, place_of_sum, rectangle, stride, left, top, label, batch, used,
+    cell_work,
+):  # fmt: skip
+    """Add the cell of one label in a block, the block's number given, to the batch."""
     u0, u1, v0, v1 = rectangle
     planes, returns_sorted = cell_work
     count, w = 0, CELLS_SIDE_BY_SIDE
@@ -55,18 +54,16 @@ def _gather(
             k = (v - top) * stride + u - left
             if scene.kind[k] != CELL or scene.label[k] != label:
                 continue
-            x, y, z = picture.ray_x[u], picture.ray_y[v], space.depth[k]
-            spread = returns.spread[v * returns.columns + u]
-            at = count * w + used
-            precision = (f32(1.0) + x * x + y * y) / (spread * spread)
+            z = space.depth[k]
+            pixel, at = v * returns.columns + u, count * w + used
             batch.residual[at] = z - scene.depth[k]
-            batch.precision[at] = precision
+            batch.precision[at] = returns.precision[pixel]
             lost_here = lost if scene.near_outline[k] != 0 and z < scene.depth[k] + f32(LOST_DEPTH) else f32(0.0)
-            batch.root[at] = (f32(1.0) - lost_here * f32(LOST_DEPTH)) * np.sqrt(precision * f32(1 / (2 * np.pi)))
-            batch.outlier[at] = picture.outlier_scale * z * z
+            batch.root[at] = (f32(1.0) - lost_here * f32(LOST_DEPTH)) * returns.root[pixel]
+            batch.outlier[at] = outlier_scale * z * z
             batch.lost[at] = lost_here
             for s in range(len(planes) if label != TABLE else 0):
-                planes[s] += returns.own_plane[(s * returns.rows + v) * returns.columns + u]
+                planes[s] += returns.own_plane[s * returns.rows * returns.columns + pixel]
             column, row = column + u, row + v
             count += 1
     median = _median(batch.residual, used, count, returns_sorted)
@@ -74,11 +71,11 @@ def _gather(
     behind = f32(SEEN_THROUGH_NATS) * max(median - f32(SEEN_THROUGH), f32(0.0))
     for s in range(len(batch.own_plane) // w):
         batch.own_plane[s * w + used] = planes[s] - behind if label != TABLE else NO_MODE
-    batch.label[used], batch.place_of_sum[used] = label, place_of_sum
+    batch.label[used], batch.place_of_sum[used], batch.block[used] = label, place_of_sum, number
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
 
 
-@strict
+@inlined
 def _clear(batch, returns):
     w = CELLS_SIDE_BY_SIDE
     for k in range(returns * w):
@@ -88,7 +85,7 @@ def _clear(batch, returns):
         batch.start[c], batch.label[c], batch.place_of_sum[c] = f32(0), 0, 0
 
 
-@strict
+@inlined
 def _add_cells(batch, used, label, sums, column):
     """Add the batch's log likelihoods, of cells of one label, to the rows of sums that they belong to."""
     for c in range(used):
@@ -100,63 +97,73 @@ def _add_cells(batch, used, label, sums, column):
 def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
     """Add the batch's cells to sums; keep those of the new object. Returns how many cells are kept now."""
     sigma, p_outlier, table, scale, amplitudes = nodes
-    w, tables, scales = CELLS_SIDE_BY_SIDE, len(table), len(scale)
+    w, pairs, tables, scales = CELLS_SIDE_BY_SIDE, len(sigma), len(table), len(scale)
+    height, place, curvature, outliers = batch.height, batch.place, batch.curvature, batch.outliers
     of_table, of_old, of_new = 0, 0, 0
     for c in range(used):
         of_table += 1 if batch.label[c] == TABLE else 0
         of_old += 1 if batch.label[c] == OLD else 0
         of_new += 1 if batch.label[c] == NEW else 0
-    for s in range(len(sigma)):
+    for s in range(pairs):
         find_modes(batch, returns, sigma[s], p_outlier[s], s == 0)
         for t in range(tables if of_table > 0 else 0):
-            table_cells(batch, table[t] * table[t])
+            table_cells(height, place, curvature, outliers, table[t] * table[t], batch.value)
             _add_cells(batch, used, TABLE, fixed, s * tables + t)
         for a in range(scales if of_old > 0 else 0):
+            variance = f32(scale[a] ** 2 * (amplitudes.model**2 + amplitudes.wave**2))
             normal_cells(
-                batch, s, f32(scale[a] ** 2 * (amplitudes.model**2 + amplitudes.wave**2)), amplitudes.bad_share
-            )
+                height, place, curvature, outliers, batch.own_plane, s * w, variance, f32(amplitudes.bad_share),
+                batch.value,
+            )  # fmt: skip
             _add_cells(batch, used, OLD, old, s * scales + a)
         kept = new_cells
         for c in range(used if of_new > 0 else 0):
             if batch.label[c] != NEW:
                 continue
+            at = kept * pairs + s
             for which in range(2):
-                at = 2 * s * most + which * most + kept
-                own.height[at] = batch.height[which * w + c]
-                own.place[at] = batch.place[which * w + c]
-                own.curvature[at] = batch.curvature[which * w + c]
-            own.outliers[s * most + kept] = batch.outliers[c]
-            own.bad[s * most + kept] = batch.own_plane[s * w + c]
-            own.column[kept], own.row[kept], own.number[kept] = batch.column[c], batch.row[c], batch.number[c]
+                own.height[which * most * pairs + at] = batch.height[which * w + c]
+                own.place[which * most * pairs + at] = batch.place[which * w + c]
+                own.curvature[which * most * pairs + at] = batch.curvature[which * w + c]
+            own.outliers[at], own.bad[at] = batch.outliers[c], batch.own_plane[s * w + c]
+            own.block[kept], own.number[kept] = batch.block[c], batch.number[c]
+            own.column[kept], own.row[kept] = batch.column[c], batch.row[c]
             kept += 1
     return new_cells + of_new
 
 
-@strict
-def _score_pixels(picture, returns, space, scene, rectangle, stride, left, top, nodes, work, sums):
-    """Add the log densities of returns that belong to no cell to sums."""
+@inlined
+def _score_pixels(
+    picture, returns, space, scene, rectangle, stride, left, top, nodes, edges, used, values, place_of_sum, sums
+):  # fmt: skip
+    """Add the log densities of returns that belong to no cell to sums, those at edges once there are many side by side.
+    Returns how many edges wait."""
     sigma, p_outlier, table, _, amplitudes = nodes
-    window, values = work
     u0, u1, v0, v1 = rectangle
     tables = len(table)
     for v in range(v0, v1):
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
             kind = scene.kind[k]
-            if kind != UNKNOWN and kind != EDGE and kind != HIDDEN:
-                continue
             if kind == EDGE:
-                log_edge(picture, returns, space, scene.depth, scene.label, k, stride, left, top, nodes, window, values)
+                put_edge(edges, used, picture, returns, u, v, space.depth[k], k, place_of_sum)
+                used += 1
+                if used == EDGES_SIDE_BY_SIDE:
+                    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
+                    used = 0
+            if kind != UNKNOWN and kind != HIDDEN:
+                continue
             for s in range(len(sigma)):
                 if kind == UNKNOWN and amplitudes.unknown > 0:
                     values[s] = returns.own_plane[(s * returns.rows + v) * returns.columns + u]
                 elif kind == UNKNOWN:
                     values[s] = log(p_outlier[s] * picture.outlier_scale * space.depth[k] * space.depth[k])
-                elif kind == HIDDEN:
+                else:
                     lost = f32(LOST_SHARE) * amplitudes.edge_share if scene.near_outline[k] != 0 else f32(0.0)
                     values[s] = log(p_outlier[s] + lost)
                 for t in range(tables):
-                    sums[s * tables + t] += values[s]
+                    sums[place_of_sum, s * tables + t] += values[s]
+    return used
 
 
 @strict
@@ -169,23 +176,30 @@ def score_blocks(
     height, width = len(picture.ray_y), len(picture.ray_x)
     across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
-    used, new_cells = 0, 0
+    edges, values = work
+    used, new_cells, edges_used = 0, 0, 0
     _clear(batch, returns_a_cell)
     for number in blocks:
         v, u = number // across * block, number % across * block
         here = (u, min(u + block, width), v, min(v + block, height))
         place = 0 if one_row else number
-        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, work, fixed[place])
+        edges_used = _score_pixels(
+            picture, returns, space, scene, here, stride, left, top, nodes, edges, edges_used, values, place, fixed
+        )  # fmt: skip
         here_labels = _labels_of_cells(scene, here, stride, left, top)
         for label in range(TABLE, NEW + 1):
             if here_labels >> label & 1 == 0:
                 continue
-            _gather(picture, returns, space, scene, lost, place, here, stride, left, top, label, batch, used, cell_work)
+            _gather(
+                returns, space, scene, picture.outlier_scale, lost, number, place, here, stride, left, top, label,
+                batch, used, cell_work,
+            )  # fmt: skip
             used += 1
             if used == CELLS_SIDE_BY_SIDE:
                 new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
                 used = 0
                 _clear(batch, returns_a_cell)
+    add_edges(edges, edges_used, picture, scene.depth, scene.label, stride, nodes, fixed)
     if used > 0:
         new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
     return new_cells

@@ -24,6 +24,8 @@ from bayes3d_ros.likelihood.shared_errors import (
 )
 
 CELLS_SIDE_BY_SIDE = 64
+# Densities of returns (1e-8 to 1e4 a metre) of which one logarithm is taken: their product is a number in float32.
+RETURNS_A_LOG = 3
 NO_MODE = f32(-1e30)  # stands for -inf
 _LOG_BAD_WIDTH = f32(0.5 * np.log(2 * np.pi) - np.log(BAD_DEPTH) - np.log(2))  # half of the bad cells
 LOG_HALF = f32(-np.log(2))
@@ -37,8 +39,11 @@ class Batch(NamedTuple):
     root: Float[np.ndarray, "K*w"]  # of precision / 2 pi, less for what may be lost; 0 where there is no return
     outlier: Float[np.ndarray, "K*w"]
     lost: Float[np.ndarray, "K*w"]  # density of a return near an outline that lies up to `LOST_DEPTH` behind
+    none: Float[np.ndarray, "K*w"]  # density of a return that is none of the surface's, at one pair of noise
+    peak: Float[np.ndarray, "K*w"]  # of a return on the surface, times the share of inliers
     label: Int[np.ndarray, "w"]
     place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a cell is added to
+    block: Int[np.ndarray, "w"]  # number of the block, by rows
     column: Float[np.ndarray, "w"]  # mean place of its pixels
     row: Float[np.ndarray, "w"]
     number: Float[np.ndarray, "w"]  # of returns
@@ -50,6 +55,7 @@ class Batch(NamedTuple):
     inliers: Float[np.ndarray, "2*w"]
     outliers: Float[np.ndarray, "w"]
     pull: Float[np.ndarray, "w"]
+    product: Float[np.ndarray, "w"]  # of a few returns' densities
     value: Float[np.ndarray, "w"]
 
 
@@ -61,6 +67,9 @@ def new_batch(returns, pairs):
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
+        np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
+        np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
+        np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
@@ -75,73 +84,82 @@ def new_batch(returns, pairs):
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),
+        np.ones(CELLS_SIDE_BY_SIDE, np.float32),
     )
 
 
 @fast
-def _one_step(batch, returns, at, sigma, p):
-    """Responsibilities of inliers at the mode's place, and the place of their mean."""
+def _begin_modes(batch, returns, sigma, p):
+    """The density of each return at one pair of noise if it is none of the surface's, and the log of their product; and
+    the height of an inlier's."""
+    w = u64(CELLS_SIDE_BY_SIDE)
+    outlier, lost, root, none, peak = batch.outlier, batch.lost, batch.root, batch.none, batch.peak
+    product, outliers, inlier, of_surface = batch.product, batch.outliers, (f32(1.0) - p) / sigma, f32(1.0) - p
+    for c in range(w):
+        outliers[c], product[c] = f32(0.0), f32(1.0)
+    for slot in range(returns):
+        first, last = u64(slot) * w, slot % RETURNS_A_LOG == RETURNS_A_LOG - 1 or slot == returns - 1
+        for c in range(w):
+            here = p * outlier[first + c] + of_surface * lost[first + c]
+            none[first + c], peak[first + c] = here, inlier * root[first + c]
+            product[c] *= here if root[first + c] > f32(0.0) else f32(1.0)
+        if last:
+            for c in range(w):
+                outliers[c] += log(product[c])
+                product[c] = f32(1.0)
+
+
+@fast
+def _follow_mode(batch, returns, at, sigma, steps):
+    """Move a mode of every cell to the mean of its inliers, so many times."""
     w = u64(CELLS_SIDE_BY_SIDE)
     place, pull, weight, inliers = batch.place, batch.pull, batch.curvature, batch.inliers
-    residual, precision, root, outlier = batch.residual, batch.precision, batch.root, batch.outlier
-    lost = batch.lost
-    at = u64(at)
-    for c in range(w):
-        pull[c] = f32(0.0)
-        weight[at + c] = f32(0.0)
-        inliers[at + c] = f32(0.0)
-    scale, norm = f32(-0.5) / (sigma * sigma), (f32(1.0) - p) / sigma
-    for slot in range(u64(returns)):
-        first = slot * w
+    residual, precision, peak, none = batch.residual, batch.precision, batch.peak, batch.none
+    at, scale = u64(at), f32(-0.5) / (sigma * sigma)
+    for _ in range(steps):
         for c in range(w):
-            e, iv = residual[first + c], precision[first + c]
-            off = e - place[at + c]
-            inlier = norm * root[first + c] * exp(scale * off * off * iv)
-            share = inlier / (p * outlier[first + c] + (f32(1.0) - p) * lost[first + c] + inlier)
-            pull[c] += share * iv * e
-            weight[at + c] += share * iv
-            inliers[at + c] += share
-    for c in range(w):
-        mean = pull[c] / max(weight[at + c], f32(1e-12))
-        place[at + c] = mean if inliers[at + c] > f32(1e-6) else place[at + c]
+            pull[c], weight[at + c], inliers[at + c] = f32(0.0), f32(0.0), f32(0.0)
+        for slot in range(u64(returns)):
+            first = slot * w
+            for c in range(w):
+                e, iv = residual[first + c], precision[first + c]
+                off = e - place[at + c]
+                inlier = peak[first + c] * exp(scale * off * off * iv)
+                share = inlier / (none[first + c] + inlier)
+                pull[c] += share * iv * e
+                weight[at + c] += share * iv
+                inliers[at + c] += share
+        for c in range(w):
+            mean = pull[c] / larger(weight[at + c], f32(1e-12))
+            place[at + c] = mean if inliers[at + c] > f32(1e-6) else place[at + c]
 
 
 @fast
-def _look(batch, returns, at, sigma, p):
-    """Height and curvature of the mode at its place."""
+def _look(batch, returns, at, sigma):
+    """Height and curvature of a mode of every cell at its place."""
     w = u64(CELLS_SIDE_BY_SIDE)
-    place, height, weight, inliers, outliers = (
-        batch.place,
-        batch.height,
-        batch.curvature,
-        batch.inliers,
-        batch.outliers,
-    )
-    residual, precision, root, outlier = batch.residual, batch.precision, batch.root, batch.outlier
-    lost = batch.lost
-    at = u64(at)
+    place, height, weight, inliers, product = batch.place, batch.height, batch.curvature, batch.inliers, batch.product
+    residual, precision, root, none, peak = batch.residual, batch.precision, batch.root, batch.none, batch.peak
+    at, scale, certain = u64(at), f32(-0.5) / (sigma * sigma), f32(1.0) / (sigma * sigma)
     for c in range(w):
-        height[at + c] = f32(0.0)
-        weight[at + c] = f32(0.0)
-        inliers[at + c] = f32(0.0)
-        outliers[c] = f32(0.0)
-    scale, norm = f32(-0.5) / (sigma * sigma), (f32(1.0) - p) / sigma
-    for slot in range(u64(returns)):
-        first = slot * w
+        height[at + c], weight[at + c], inliers[at + c], product[c] = f32(0.0), f32(0.0), f32(0.0), f32(1.0)
+    for slot in range(returns):
+        first, last = u64(slot) * w, slot % RETURNS_A_LOG == RETURNS_A_LOG - 1 or slot == returns - 1
         for c in range(w):
             iv = precision[first + c]
             off = residual[first + c] - place[at + c]
-            real = root[first + c] > f32(0.0)
-            none = p * outlier[first + c] + (f32(1.0) - p) * lost[first + c]
-            inlier = norm * root[first + c] * exp(scale * off * off * iv)
-            total = none + inlier
+            inlier = peak[first + c] * exp(scale * off * off * iv)
+            total = none[first + c] + inlier
             share = inlier / total
-            height[at + c] += log(total) if real else f32(0.0)
-            outliers[c] += log(none) if real else f32(0.0)
+            product[c] *= total if root[first + c] > f32(0.0) else f32(1.0)
             weight[at + c] += share * iv
             inliers[at + c] += share
+        if last:
+            for c in range(w):
+                height[at + c] += log(product[c])
+                product[c] = f32(1.0)
     for c in range(w):
-        weight[at + c] /= sigma * sigma
+        weight[at + c] *= certain
 
 
 @strict
@@ -152,10 +170,10 @@ def find_modes(batch, returns, sigma, p, first):
     for c in range(w if first else 0):
         batch.place[c] = f32(0.0)
         batch.place[w + c] = batch.start[c]
+    _begin_modes(batch, returns, sigma, p)
     for at in range(0, 2 * w, w):
-        for _ in range(MODE_STEPS if first else MORE_MODE_STEPS):
-            _one_step(batch, returns, at, sigma, p)
-        _look(batch, returns, at, sigma, p)
+        _follow_mode(batch, returns, at, sigma, MODE_STEPS if first else MORE_MODE_STEPS)
+        _look(batch, returns, at, sigma)
     for at in range(0, 2 * w):
         if batch.inliers[at] <= f32(FEWEST_INLIERS):
             batch.height[at] = NO_MODE
@@ -195,12 +213,10 @@ def bad_mode(height, place, curvature):
 
 
 @fast
-def normal_cells(batch, s, variance, share):
-    """log likelihood of each cell of the batch at pair of noise s: with an offset ~ N(0, variance), or, with
-    probability `share`, as a bad cell."""
-    w = u64(CELLS_SIDE_BY_SIDE)
-    own_plane, at = batch.own_plane, u64(s) * w
-    height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value
+def normal_cells(height, place, curvature, outliers, own_plane, at, variance, share, value):
+    """log likelihood of each cell of a batch, whose planes of their own begin at a place: with an offset ~
+    N(0, variance), or, with probability `share`, as a bad cell."""
+    w, at = u64(CELLS_SIDE_BY_SIDE), u64(at)
     for c in range(w):
         one = _good(height[c], place[c], curvature[c], f32(0.0), variance)
         other = _good(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)
@@ -214,10 +230,9 @@ def normal_cells(batch, s, variance, share):
 
 
 @fast
-def table_cells(batch, variance):
-    """log likelihood of each cell of the batch with an offset ~ N(0, variance)."""
+def table_cells(height, place, curvature, outliers, variance, value):
+    """log likelihood of each cell of a batch with an offset ~ N(0, variance)."""
     w = u64(CELLS_SIDE_BY_SIDE)
-    height, place, curvature, outliers, value = batch.height, batch.place, batch.curvature, batch.outliers, batch.value
     for c in range(w):
         one = _good(height[c], place[c], curvature[c], f32(0.0), variance)
         other = _good(height[w + c], place[w + c], curvature[w + c], f32(0.0), variance)

@@ -1,98 +1,220 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Densities of the returns of edge pixels, whose windows show several surfaces. They are those of
-`likelihood/slow_shared_errors.py`, written again in scalars; tests compare them."""
+"""Densities of the returns of edge pixels, whose windows show several surfaces, many pixels side by side. The densities
+are those of `likelihood/slow_shared_errors.py`, written again in scalars; tests compare them."""
+
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, i32, u64
-from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
+from bayes3d_ros.likelihood.cpu.buffers import NO_SURFACE_METRES, f32, u8, u64, whole_vectors
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, inlined, strict
+from bayes3d_ros.likelihood.cpu.packing import larger, lesser
 from bayes3d_ros.likelihood.cpu.patches import TABLE
 from bayes3d_ros.likelihood.cpu.windows import exp, log
-from bayes3d_ros.likelihood.density import LATERAL
+from bayes3d_ros.likelihood.density import FAR_AWAY, LATERAL
 from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE
 
-_SLOTS = 16  # of the points in a window: whole vectors
+EDGES_SIDE_BY_SIDE = 64
+_POINTS = 9  # of a window
+_FARTHEST = 2  # squared pixels from a window's middle to its corners
 
 
-@strict
-def log_edge(picture, returns, space, depth, label, k, stride, left, top, nodes, window, values):
-    """log density of the return of an edge pixel at every pair of noise, written to `values`. window: 4 rows of
-    working memory, and 3 weights, of points that are 0, 1 and 2 squared pixels farther away than the nearest."""
-    sigma, p_outlier, table, _, amplitudes = nodes
-    row, column = k // stride, k - k // stride * stride
-    x, y = picture.ray_x[column + left], picture.ray_y[row + top]
-    z = space.depth[k]
-    norm2 = f32(1.0) + x * x + y * y
-    outlier = picture.outlier_scale * z * z
-    spread = returns.spread[(row + top) * returns.columns + column + left]
-    of_object = (
-        amplitudes.bias * amplitudes.bias + amplitudes.wave * amplitudes.wave + amplitudes.model * amplitudes.model
-    )
-    of_table = table[len(table) // 2] * table[len(table) // 2]
-    step_x, step_y = f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y
-    offs, owns, acrosses, weights = window[0], window[1], window[2], window[3]
-    nearest, least, count = f32(1e30), 9, 0
-    front, back, of_objects = f32(NO_SURFACE_METRES), f32(0.0), False
-    for dv in range(-1, 2):
-        for du in range(-1, 2):
-            d = depth[k + dv * stride + du]
-            if d < f32(NO_SURFACE_METRES):
-                ex, ey = f32(du) * step_x, f32(dv) * step_y
-                turned = ex * y - ey * x
-                across = d * d * (ex * ex + ey * ey + turned * turned) / norm2
-                nearest, least = min(nearest, across), min(least, du * du + dv * dv)
-                on_table = label[k + dv * stride + du] == TABLE
-                of_objects |= not on_table
-                offs[count] = z - d * (f32(1.0) + (ex * x + ey * y) / norm2)
-                owns[count] = of_table if on_table else f32(of_object)
-                acrosses[count], weights[count] = across, f32(du * du + dv * dv)
-                front, back = min(front, d), max(back, d)
-                count += 1
-    blur, bad, share = f32(amplitudes.edge_blur), f32(amplitudes.bad_share), f32(amplitudes.edge_share)
-    dented = f32(1 / BAD_DEPTH) if (z < front) & (z > front - f32(BAD_DEPTH)) else f32(0.0)
-    lost = f32(LOST_SHARE / LOST_DEPTH) * share if z < front + f32(LOST_DEPTH) else f32(0.0)
-    if blur > 0:
-        for c in range(count):
-            weights[c] = window[4][i32(weights[c]) - least]
-        for c in range(count, _SLOTS):
-            weights[c] = f32(0.0)
-    for s in range(len(sigma)):
-        p, noise = p_outlier[s], sigma[s] * spread
-        if count == 0:
-            values[s] = log(p * outlier + (f32(1.0) - p) * outlier)
-            continue
-        if blur <= 0:
-            for c in range(count):
-                weights[c] = exp(f32(-0.5) * (acrosses[c] - nearest) / (noise * noise)) + f32(LATERAL)
-            for c in range(count, _SLOTS):
-                weights[c] = f32(0.0)
-        mixture = _mixture(weights, offs, owns, noise * noise / norm2)
-        if of_objects:
-            mixture = (f32(1.0) - bad) * mixture + bad * dented
-        behind = max(back, front + f32(4.0) * noise)
-        between = f32(1.0) / (behind - front) if front < z < behind else f32(0.0)
-        inside = (f32(1.0) - share) * mixture + share * between
-        inside = lost + (f32(1.0) - lost * f32(LOST_DEPTH)) * inside
-        values[s] = log(p * outlier + (f32(1.0) - p) * inside)
+class Edges(NamedTuple):
+    """Edge pixels side by side, w of them, and the K points in the window of each."""
 
-
-@fast
-def _mixture(weights, offs, owns, noise2):
-    """The mean of normal densities at `offs`, with variances `noise2` + `owns`, in all slots side by side."""
-    total, all_weights = f32(0.0), f32(0.0)
-    for c in range(u64(_SLOTS)):
-        precision = f32(1.0) / (noise2 + owns[c])
-        density = exp(f32(-0.5) * offs[c] * offs[c] * precision) * np.sqrt(precision * f32(1 / (2 * np.pi)))
-        total += weights[c] * density
-        all_weights += weights[c]
-    return total / all_weights
+    place: Int[np.ndarray, "w"]  # in the patch
+    place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a pixel is added to
+    depth: Float[np.ndarray, "w"]  # observed
+    x: Float[np.ndarray, "w"]
+    y: Float[np.ndarray, "w"]
+    norm2: Float[np.ndarray, "w"]
+    spread: Float[np.ndarray, "w"]
+    outlier: Float[np.ndarray, "w"]  # its density
+    point: Float[np.ndarray, "K*w"]  # depth
+    on_table: Float[np.ndarray, "K*w"]  # 1 or 0
+    off: Float[np.ndarray, "K*w"]  # metres that the return lies behind a point, along the ray
+    across: Float[np.ndarray, "K*w"]  # squared distance of a point from the ray
+    weight: Float[np.ndarray, "K*w"]
+    nearest: Float[np.ndarray, "w"]  # the least of `across`
+    least: Float[np.ndarray, "w"]  # squared pixels to the nearest point
+    front: Float[np.ndarray, "w"]  # the least and the largest depth in the window
+    back: Float[np.ndarray, "w"]
+    of_objects: Float[np.ndarray, "w"]  # 1 where there is an object in the window, or 0
+    precision_table: Float[np.ndarray, "w"]  # of a return of the table, and of an object
+    precision_object: Float[np.ndarray, "w"]
+    total: Float[np.ndarray, "w"]
+    weights: Float[np.ndarray, "w"]
+    value: Float[np.ndarray, "w"]
 
 
 @allocating
-def new_window(blur):
-    """Working memory of `log_edge`."""
-    window = np.ones((5, _SLOTS), np.float32)
-    for k in range(3):
-        window[4, k] = np.exp(f32(-0.5) * f32(k) / (blur * blur)) if blur > 0 else f32(0)
-    return window
+def new_edges():
+    one, all_points = np.ones(EDGES_SIDE_BY_SIDE, np.float32), np.ones(_POINTS * EDGES_SIDE_BY_SIDE, np.float32)
+    whole = np.zeros(EDGES_SIDE_BY_SIDE, np.int32)
+    return Edges(
+        whole, whole.copy(), one, one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), all_points,
+        all_points.copy(), all_points.copy(), all_points.copy(), all_points.copy(), one.copy(), one.copy(), one.copy(),
+        one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(),
+    )  # fmt: skip
+
+
+@inlined
+def put_edge(edges, at, picture, returns, column, row, z, place, place_of_sum):
+    """Put the return of an edge pixel of the image into a slot."""
+    x, y = picture.ray_x[column], picture.ray_y[row]
+    edges.place[at], edges.place_of_sum[at] = place, place_of_sum
+    edges.depth[at], edges.x[at], edges.y[at] = z, x, y
+    edges.norm2[at] = f32(1.0) + x * x + y * y
+    edges.spread[at] = returns.spread[row * returns.columns + column]
+    edges.outlier[at] = picture.outlier_scale * z * z
+
+
+@inlined
+def _repeat_last(edges, used, full):
+    """Slots up to a whole vector repeat the last one."""
+    for k in range(used, full):
+        edges.place[k] = edges.place[used - 1]
+        edges.depth[k], edges.x[k], edges.y[k] = edges.depth[used - 1], edges.x[used - 1], edges.y[used - 1]
+        edges.norm2[k], edges.spread[k] = edges.norm2[used - 1], edges.spread[used - 1]
+        edges.outlier[k] = edges.outlier[used - 1]
+
+
+@fast
+def _pick(edges, depth, label, stride, full):
+    """The points of every window."""
+    place, point, on_table = edges.place, edges.point, edges.on_table
+    for number in range(_POINTS):
+        offset, to = (number // 3 - 1) * stride + number % 3 - 1, u64(number * EDGES_SIDE_BY_SIDE)
+        for k in range(u64(full)):
+            at = u64(place[k] + offset)
+            point[to + k] = depth[at]
+            on_table[to + k] = f32(1.0) if label[at] == u8(TABLE) else f32(0.0)
+
+
+@fast
+def _measure(edges, step_x, step_y, full):
+    """How far the points of every window are from the return, and what surfaces the window shows."""
+    z, x, y, norm2, point, on_table = edges.depth, edges.x, edges.y, edges.norm2, edges.point, edges.on_table
+    off, across, nearest, least = edges.off, edges.across, edges.nearest, edges.least
+    front, back, of_objects = edges.front, edges.back, edges.of_objects
+    for k in range(u64(full)):
+        nearest[k], least[k] = f32(FAR_AWAY), f32(_FARTHEST)
+        front[k], back[k], of_objects[k] = f32(NO_SURFACE_METRES), f32(0.0), f32(0.0)
+    for number in range(_POINTS):
+        du, dv, to = number % 3 - 1, number // 3 - 1, u64(number * EDGES_SIDE_BY_SIDE)
+        ex, ey, squared = f32(du) * step_x, f32(dv) * step_y, f32(du * du + dv * dv)
+        sides = ex * ex + ey * ey
+        for k in range(u64(full)):
+            d, over = point[to + k], f32(1.0) / norm2[k]
+            real = d < f32(NO_SURFACE_METRES)
+            turned = ex * y[k] - ey * x[k]
+            apart = d * d * (sides + turned * turned) * over
+            behind = z[k] - d * (f32(1.0) + (ex * x[k] + ey * y[k]) * over)
+            across[to + k] = apart if real else f32(FAR_AWAY)
+            off[to + k] = behind if real else f32(0.0)
+            nearest[k] = lesser(nearest[k], apart if real else f32(FAR_AWAY))
+            least[k] = lesser(least[k], squared if real else f32(_FARTHEST))
+            front[k] = lesser(front[k], d)
+            back[k] = larger(back[k], d if real else f32(0.0))
+            object_here = f32(1.0) - on_table[to + k]
+            of_objects[k] = larger(of_objects[k], object_here if real else f32(0.0))
+
+
+@fast
+def _blur(edges, one, two, full):
+    """Weights of the points of every window, as a blur of the image says. one, two: weights of points that are so many
+    squared pixels farther away than the nearest."""
+    point, weight, least = edges.point, edges.weight, edges.least
+    for number in range(_POINTS):
+        du, dv, to = number % 3 - 1, number // 3 - 1, u64(number * EDGES_SIDE_BY_SIDE)
+        squared = f32(du * du + dv * dv)
+        for k in range(u64(full)):
+            farther = squared - least[k]
+            here = one if farther > f32(0.5) else f32(1.0)
+            here = two if farther > f32(1.5) else here
+            weight[to + k] = here if point[to + k] < f32(NO_SURFACE_METRES) else f32(0.0)
+
+
+@fast
+def _near(edges, sigma, full):
+    """The same without a blur, as distances from the ray say."""
+    point, weight, across, nearest, spread = edges.point, edges.weight, edges.across, edges.nearest, edges.spread
+    for number in range(_POINTS):
+        to = u64(number * EDGES_SIDE_BY_SIDE)
+        for k in range(u64(full)):
+            noise = sigma * spread[k]
+            here = exp(f32(-0.5) * (across[to + k] - nearest[k]) / (noise * noise)) + f32(LATERAL)
+            weight[to + k] = here if point[to + k] < f32(NO_SURFACE_METRES) else f32(0.0)
+
+
+@fast
+def _mix(edges, sigma, of_table, of_object, full):
+    """The mixtures of normal densities."""
+    norm2, spread, precision_table, precision_object = (
+        edges.norm2,
+        edges.spread,
+        edges.precision_table,
+        edges.precision_object,
+    )
+    off, on_table, weight, total, weights = edges.off, edges.on_table, edges.weight, edges.total, edges.weights
+    for k in range(u64(full)):
+        noise = sigma * spread[k]
+        noise2 = noise * noise / norm2[k]
+        precision_table[k] = f32(1.0) / (noise2 + of_table)
+        precision_object[k] = f32(1.0) / (noise2 + of_object)
+        total[k], weights[k] = f32(0.0), f32(0.0)
+    for number in range(_POINTS):
+        to = u64(number * EDGES_SIDE_BY_SIDE)
+        for k in range(u64(full)):
+            table, away, share = on_table[to + k], off[to + k], weight[to + k]
+            precision = table * precision_table[k] + (f32(1.0) - table) * precision_object[k]
+            density = exp(f32(-0.5) * away * away * precision) * np.sqrt(precision * f32(1 / (2 * np.pi)))
+            total[k] += share * density
+            weights[k] += share
+
+
+@fast
+def _finish(edges, sigma, p, bad, share, full):
+    """Log densities, from the mixtures; those of outliers where a window shows no surface."""
+    z, spread, outlier, front, back = edges.depth, edges.spread, edges.outlier, edges.front, edges.back
+    of_objects, total, weights, value = edges.of_objects, edges.total, edges.weights, edges.value
+    for k in range(u64(full)):
+        seen, near, none, worse = z[k], front[k], outlier[k], bad * of_objects[k]
+        mixture = total[k] / larger(weights[k], f32(1e-30))
+        dented = f32(1 / BAD_DEPTH) if (seen < near) & (seen > near - f32(BAD_DEPTH)) else f32(0.0)
+        mixture = (f32(1.0) - worse) * mixture + worse * dented
+        behind = larger(back[k], near + f32(4.0) * sigma * spread[k])
+        evenly = f32(1.0) / (behind - near)
+        between = evenly if (seen > near) & (seen < behind) else f32(0.0)
+        lost = f32(LOST_SHARE / LOST_DEPTH) * share if seen < near + f32(LOST_DEPTH) else f32(0.0)
+        inside = (f32(1.0) - share) * mixture + share * between
+        inside = lost + (f32(1.0) - lost * f32(LOST_DEPTH)) * inside
+        inside = inside if near < f32(NO_SURFACE_METRES) else none
+        value[k] = log(p * none + (f32(1.0) - p) * inside)
+
+
+@strict
+def add_edges(edges, used, picture, depth, label, stride, nodes, sums):
+    """Add the log densities of the returns in the first slots to the rows of sums that they belong to."""
+    sigma, p_outlier, table, _, amplitudes = nodes
+    if used == 0:
+        return
+    full, tables = whole_vectors(used), len(table)
+    of_object = f32(amplitudes.bias**2 + amplitudes.wave**2 + amplitudes.model**2)
+    of_table, blur = table[tables // 2] * table[tables // 2], f32(amplitudes.edge_blur)
+    _repeat_last(edges, used, full)
+    _pick(edges, depth, label, stride, full)
+    _measure(edges, f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y, full)
+    if blur > 0:
+        one = exp(f32(-0.5) / (blur * blur))
+        _blur(edges, one, one * one, full)
+    for s in range(len(sigma)):
+        if blur <= 0:
+            _near(edges, sigma[s], full)
+        _mix(edges, sigma[s], of_table, of_object, full)
+        _finish(edges, sigma[s], p_outlier[s], f32(amplitudes.bad_share), f32(amplitudes.edge_share), full)
+        for c in range(used):
+            for t in range(tables):
+                sums[edges.place_of_sum[c], s * tables + t] += edges.value[c]

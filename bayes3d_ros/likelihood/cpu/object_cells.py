@@ -10,25 +10,35 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayes3d_ros.likelihood.cpu.buffers import f32, u64
+from bayes3d_ros.likelihood.cpu.buffers import f32, u64, whole_vectors
 from bayes3d_ros.likelihood.cpu.cells import LOG_HALF, NO_MODE, bad_mode
-from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, strict
+from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, inlined, strict
 from bayes3d_ros.likelihood.cpu.packing import larger
 from bayes3d_ros.likelihood.cpu.windows import exp, log
 from bayes3d_ros.likelihood.shared_errors import BAD_SPREAD, BAD_WEIGHT, REWEIGHTED_STEPS
 
 _SPREADS, _WEIGHTS = np.array(BAD_SPREAD, np.float32), np.log(np.array(BAD_WEIGHT)).astype(np.float32)
+NODES_SIDE_BY_SIDE = 16
+# Rows of `ObjectCells.node`: of the cell that is looked at,
+_HEIGHT, _PLACE, _CURVATURE, _OUTLIERS, _BAD = 0, 2, 4, 6, 7  # the first three for either mode
+# what the cells to the left and above tell of the waves, and what the cell itself tells;
+_TOLD_LEFT, _PLACE_LEFT, _TOLD_ABOVE, _PLACE_ABOVE, _TOLD, _TOLD_PLACE = 8, 9, 10, 11, 12, 13
+# of the node: variances of a cell's own error and of the waves; and sums over the cells.
+_VARIANCE, _WAVES, _SUMS = 14, 15, 16
+_INFORMATION, _PULL, _LOGS, _NUMBERS = 0, 6, 9, 12  # of these sums: six, three and three, in all
 
 
 class ObjectCells(NamedTuple):
-    """The cells of one object at every pair of noise: S times M of them."""
+    """Up to M cells of one object at S pairs of noise; and working memory for w nodes side by side. A node is a pair of
+    noise and a scale of the amplitudes."""
 
-    place: Float[np.ndarray, "S*2*M"]
-    height: Float[np.ndarray, "S*2*M"]
-    curvature: Float[np.ndarray, "S*2*M"]
-    outliers: Float[np.ndarray, "S*M"]
-    bad: Float[np.ndarray, "S*M"]  # log likelihood as a bad cell, without the case of outliers
-    column: Float[np.ndarray, "M"]
+    place: Float[np.ndarray, "2*M*S"]
+    height: Float[np.ndarray, "2*M*S"]
+    curvature: Float[np.ndarray, "2*M*S"]
+    outliers: Float[np.ndarray, "M*S"]
+    bad: Float[np.ndarray, "M*S"]  # log likelihood as a bad cell, without the case of outliers
+    block: Int[np.ndarray, "M"]  # number of the block, by rows
+    column: Float[np.ndarray, "M"]  # mean place of the pixels
     row: Float[np.ndarray, "M"]
     number: Float[np.ndarray, "M"]  # of returns
     x: Float[np.ndarray, "M"]  # metres from the middle
@@ -37,8 +47,12 @@ class ObjectCells(NamedTuple):
     alike_left: Float[np.ndarray, "M"]  # correlation of the waves with those of the cell to the left, 0 where none is,
     alike_above: Float[np.ndarray, "M"]  # and with those of the one above
     alike_both: Float[np.ndarray, "M"]  # of these two with each other
-    told: Float[np.ndarray, "M"]  # working memory: 1 / variance of the waves as a good cell shows them,
-    told_place: Float[np.ndarray, "M"]  # and their value, metres, including the object's shared error
+    told: Float[np.ndarray, "M*w"]  # 1 / variance of the waves as a good cell shows them,
+    told_place: Float[np.ndarray, "M*w"]  # and their value, metres, including the object's shared error
+    pair: Int[np.ndarray, "w"]  # of noise, of each node
+    node: Float[np.ndarray, "R*w"]  # rows: see above
+    sums: Float[np.ndarray, "12"]  # of one node, in double precision
+    pull: Float[np.ndarray, "3"]
 
 
 @allocating
@@ -49,6 +63,7 @@ def new_object_cells(pairs, most):
         np.zeros(2 * pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
+        np.zeros(most, np.int64),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
@@ -58,8 +73,12 @@ def new_object_cells(pairs, most):
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
-        np.zeros(most, np.float32),
-        np.zeros(most, np.float32),
+        np.zeros(most * NODES_SIDE_BY_SIDE, np.float32),
+        np.zeros(most * NODES_SIDE_BY_SIDE, np.float32),
+        np.zeros(NODES_SIDE_BY_SIDE, np.int64),
+        np.zeros((_SUMS + _NUMBERS) * NODES_SIDE_BY_SIDE, np.float32),
+        np.zeros(_NUMBERS),
+        np.zeros(3),
     )
 
 
@@ -80,127 +99,156 @@ def place_cells(cells, count, metres):
 
 
 @strict
-def find_neighbours(cells, count, block, length):
+def find_neighbours(cells, count, across, length):
     """The cells beside each cell, and the correlations of their waves. Cells are in the order of their blocks, rows
-    of blocks from the top. block: pixels a side; length: of waves, metres."""
-    above = 0
+    of blocks from the top. across: blocks in a row; length: of waves, metres."""
+    block, xs, ys, above = cells.block, cells.x, cells.y, 0
     for c in range(count):
-        row, column = cells.row[c] // block, cells.column[c] // block
-        while above < c and (
-            cells.row[above] // block < row - 1
-            or (cells.row[above] // block == row - 1 and cells.column[above] // block < column)
-        ):
+        here = block[c]
+        while block[above] < here - across:
             above += 1
-        has_above = above < c and cells.row[above] // block == row - 1 and cells.column[above] // block == column
-        has_left = c > 0 and cells.row[c - 1] // block == row and cells.column[c - 1] // block == column - 1
+        left = max(c - 1, 0)
+        has_above = block[above] == here - across
+        has_left = c > 0 and block[left] == here - 1 and here % across != 0
         cells.above[c] = above if has_above else 0
-        cells.alike_left[c] = _alike(cells, c, c - 1, length) if has_left else f32(0)
-        cells.alike_above[c] = _alike(cells, c, above, length) if has_above else f32(0)
-        cells.alike_both[c] = _alike(cells, c - 1, above, length) if has_left and has_above else f32(0)
+        cells.alike_left[c] = _alike(xs[c] - xs[left], ys[c] - ys[left], length) if has_left else f32(0)
+        cells.alike_above[c] = _alike(xs[c] - xs[above], ys[c] - ys[above], length) if has_above else f32(0)
+        both = has_left and has_above
+        cells.alike_both[c] = _alike(xs[left] - xs[above], ys[left] - ys[above], length) if both else f32(0)
 
 
-@strict
-def _alike(cells, one, other, length):
-    x, y = cells.x[one] - cells.x[other], cells.y[one] - cells.y[other]
+@inlined
+def _alike(x, y, length):
     return exp(-np.sqrt(x * x + y * y) / length)
 
 
 @fast
-def begin_object(cells, s, most, count, share):
-    """Log likelihoods of bad cells at one pair of noise, without the case of outliers. `cells.bad` holds those of
-    planes of the cells' own on entry."""
-    first, at = u64(2 * s * most), u64(s * most)
-    second = first + u64(most)
-    for c in range(u64(count)):
-        one = bad_mode(cells.height[first + c], cells.place[first + c], cells.curvature[first + c])
-        other = bad_mode(cells.height[second + c], cells.place[second + c], cells.curvature[second + c])
-        free = cells.bad[at + c] + LOG_HALF
+def begin_object(cells, count, share):
+    """Log likelihoods of bad cells, without the case of outliers. `cells.bad` holds those of planes of the cells' own
+    on entry."""
+    pairs, second = len(cells.outliers) // len(cells.column), u64(len(cells.outliers))
+    height, place, curvature, bad = cells.height, cells.place, cells.curvature, cells.bad
+    for k in range(u64(count * pairs)):
+        one = bad_mode(height[k], place[k], curvature[k])
+        other = bad_mode(height[second + k], place[second + k], curvature[second + k])
+        free = bad[k] + LOG_HALF
         high = larger(larger(one, other), free)
-        bad = high + log(exp(one - high) + exp(other - high) + exp(free - high))
-        cells.bad[at + c] = bad if share > f32(0.0) else NO_MODE
+        worse = high + log(exp(one - high) + exp(other - high) + exp(free - high))
+        bad[k] = worse if share > f32(0.0) else NO_MODE
 
 
 @strict
-def reference_height(cells, s, most, count):
+def _reference_height(cells, s, count):
     """The sum of the largest logs of the cells; all sums of logs are relative to it."""
-    total = 0.0
+    pairs, second, total = len(cells.outliers) // len(cells.column), len(cells.outliers), 0.0
     for c in range(count):
-        height = max(cells.height[2 * s * most + c], cells.height[2 * s * most + most + c])
-        total += max(height, cells.outliers[s * most + c])
+        k = c * pairs + s
+        total += max(max(cells.height[k], cells.height[second + k]), cells.outliers[k])
     return total
 
 
-@fast
-def _pass(cells, s, most, count, a, variance, waves, share, sums):
-    """Sums over an object's cells given its shared error a: the information (6 numbers) and pull (3) of good cells
-    on a; and the sums of the cells' logs, relative to `reference_height`, for three shares of bad cells. waves:
-    their variance."""
-    first, at = u64(2 * s * most), u64(s * most)
-    second = first + u64(most)
+@inlined
+def _fetch(cells, c, above, full):
+    """The numbers of a cell, at the nodes in the first slots."""
     height, place, curvature, outliers, bad = cells.height, cells.place, cells.curvature, cells.outliers, cells.bad
-    xs, ys, told, told_place = cells.x, cells.y, cells.told, cells.told_place
-    a0, a1, a2 = f32(a[0]), f32(a[1]), f32(a[2])
+    told, told_place, pair, node = cells.told, cells.told_place, cells.pair, cells.node
+    w, left, first = u64(NODES_SIDE_BY_SIDE), max(c - 1, 0), u64(c * (len(outliers) // len(cells.column)))
+    second = first + u64(len(outliers))
+    for k in range(u64(full)):
+        s = u64(pair[k])
+        node[u64(_HEIGHT) * w + k], node[u64(_HEIGHT + 1) * w + k] = height[first + s], height[second + s]
+        node[u64(_PLACE) * w + k], node[u64(_PLACE + 1) * w + k] = place[first + s], place[second + s]
+        node[u64(_CURVATURE) * w + k], node[u64(_CURVATURE + 1) * w + k] = curvature[first + s], curvature[second + s]
+        node[u64(_OUTLIERS) * w + k], node[u64(_BAD) * w + k] = outliers[first + s], bad[first + s]
+    to_left, to_above = u64(left) * w, u64(above) * w
+    for k in range(u64(full)):
+        node[u64(_TOLD_LEFT) * w + k], node[u64(_PLACE_LEFT) * w + k] = told[to_left + k], told_place[to_left + k]
+        node[u64(_TOLD_ABOVE) * w + k], node[u64(_PLACE_ABOVE) * w + k] = told[to_above + k], told_place[to_above + k]
+
+
+@inlined
+def _keep_told(cells, c, full):
+    """What the cell tells its neighbours of the waves, at the nodes in the first slots."""
+    told, told_place, node, w = cells.told, cells.told_place, cells.node, u64(NODES_SIDE_BY_SIDE)
+    to = u64(c) * w
+    for k in range(u64(full)):
+        told[to + k], told_place[to + k] = node[u64(_TOLD) * w + k], node[u64(_TOLD_PLACE) * w + k]
+
+
+@fast
+def _pass(cells, count, used, a, share):
+    """Sums over an object's cells given its shared error a, at the nodes in the first slots: the information and pull
+    of good cells on a; and the sums of the cells' logs, relative to `_reference_height`, for three shares of bad cells.
+    """
+    node, w, full = cells.node, u64(NODES_SIDE_BY_SIDE), whole_vectors(used) if used > 1 else 1
+    a0, a1, a2, sums = f32(a[0]), f32(a[1]), f32(a[2]), u64(_SUMS)
     few, middle, many = (
         min(share * _SPREADS[0], f32(0.9)),
         min(share * _SPREADS[1], f32(0.9)),
         min(share * _SPREADS[2], f32(0.9)),
     )
-    n, nx, ny, nxx, nxy, nyy = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
-    b, bx, by = f32(0.0), f32(0.0), f32(0.0)
-    log_few, log_middle, log_many = f32(0.0), f32(0.0), f32(0.0)
-    for c in range(u64(count)):
-        # The waves in this cell, given the good cells to the left and above.
-        constant, x, y, known, left_free = f32(1.0), xs[c], ys[c], f32(0.0), waves
-        if waves > f32(0.0):
-            alike_left, alike_above, alike_both = cells.alike_left[c], cells.alike_above[c], cells.alike_both[c]
-            has_left, has_above = alike_left > f32(0.0), alike_above > f32(0.0)
-            left, above = c - u64(1) if has_left else u64(0), u64(cells.above[c])
-            of_left = f32(1.0) + f32(1.0) / (waves * (told[left] + f32(1e-6))) if has_left else f32(1.0)
-            of_above = f32(1.0) + f32(1.0) / (waves * (told[above] + f32(1e-6))) if has_above else f32(1.0)
-            determinant = of_left * of_above - alike_both * alike_both
-            part_left = (alike_left * of_above - alike_above * alike_both) / determinant
-            part_above = (alike_above * of_left - alike_left * alike_both) / determinant
-            left_free = waves * (f32(1.0) - part_left * alike_left - part_above * alike_above)
-            constant -= part_left + part_above
-            x -= part_left * xs[left] + part_above * xs[above]
-            y -= part_left * ys[left] + part_above * ys[above]
-            known = part_left * told_place[left] + part_above * told_place[above]
-        mean = known + a0 * constant + a1 * x + a2 * y
-        here = variance + left_free
-        spread, other_spread = f32(1.0) + curvature[first + c] * here, f32(1.0) + curvature[second + c] * here
-        precision, other_precision = curvature[first + c] / spread, curvature[second + c] / other_spread
-        off, other_off = place[first + c] - mean, place[second + c] - mean
-        one = height[first + c] - f32(0.5) * (log(spread) + off * off * precision)
-        other = height[second + c] - f32(0.5) * (log(other_spread) + other_off * other_off * other_precision)
-        high = larger(larger(one, other), larger(outliers[at + c], bad[at + c]))
-        e, other_e = exp(one - high), exp(other - high)
-        none, worse = exp(outliers[at + c] - high), exp(bad[at + c] - high)
-        total = (f32(1.0) - middle) * (e + other_e) + middle * worse + none
-        high -= larger(larger(height[first + c], height[second + c]), outliers[at + c])
-        log_few += high + log(larger((f32(1.0) - few) * (e + other_e) + few * worse + none, f32(1e-37)))
-        log_middle += high + log(larger(total, f32(1e-37)))
-        log_many += high + log(larger((f32(1.0) - many) * (e + other_e) + many * worse + none, f32(1e-37)))
-        rest = (f32(1.0) - middle) / larger(total, f32(1e-37))
-        good, other_good = rest * e, rest * other_e
-        weight, other_weight = good * precision, other_good * other_precision
-        both = weight + other_weight
-        pull = weight * (place[first + c] - known) + other_weight * (place[second + c] - known)
-        n += both * constant * constant
-        nx += both * constant * x
-        ny += both * constant * y
-        nxx += both * x * x
-        nxy += both * x * y
-        nyy += both * y * y
-        b += pull * constant
-        bx += pull * x
-        by += pull * y
-        tells = good * curvature[first + c] / (f32(1.0) + curvature[first + c] * variance)
-        other_tells = other_good * curvature[second + c] / (f32(1.0) + curvature[second + c] * variance)
-        told[c] = tells + other_tells
-        told_place[c] = (tells * place[first + c] + other_tells * place[second + c]) / (told[c] + f32(1e-6))
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = n, nx, ny, nxx, nxy, nyy
-    sums[6], sums[7], sums[8] = b, bx, by
-    sums[9], sums[10], sums[11] = log_few, log_middle, log_many
+    for k in range(u64(_NUMBERS) * w):
+        node[sums * w + k] = f32(0.0)
+    for c in range(count):
+        above, left = cells.above[c], max(c - 1, 0)
+        _fetch(cells, c, above, full)
+        alike_left, alike_above, alike_both = cells.alike_left[c], cells.alike_above[c], cells.alike_both[c]
+        x_here, x_left, x_above = cells.x[c], cells.x[left], cells.x[above]
+        y_here, y_left, y_above = cells.y[c], cells.y[left], cells.y[above]
+        for k in range(u64(full)):
+            height, other_height = node[u64(_HEIGHT) * w + k], node[u64(_HEIGHT + 1) * w + k]
+            place, other_place = node[u64(_PLACE) * w + k], node[u64(_PLACE + 1) * w + k]
+            curvature, other_curvature = node[u64(_CURVATURE) * w + k], node[u64(_CURVATURE + 1) * w + k]
+            outliers, bad = node[u64(_OUTLIERS) * w + k], node[u64(_BAD) * w + k]
+            variance, waves = node[u64(_VARIANCE) * w + k], node[u64(_WAVES) * w + k]
+            # The waves in this cell, given the good cells to the left and above. Without waves these tell nothing.
+            known_left = larger(waves * (node[u64(_TOLD_LEFT) * w + k] + f32(1e-6)), f32(1e-13))
+            known_above = larger(waves * (node[u64(_TOLD_ABOVE) * w + k] + f32(1e-6)), f32(1e-13))
+            of_left, of_above = f32(1.0) + f32(1.0) / known_left, f32(1.0) + f32(1.0) / known_above
+            over = f32(1.0) / (of_left * of_above - alike_both * alike_both)
+            part_left = (alike_left * of_above - alike_above * alike_both) * over
+            part_above = (alike_above * of_left - alike_left * alike_both) * over
+            here = variance + waves * (f32(1.0) - part_left * alike_left - part_above * alike_above)
+            constant = f32(1.0) - part_left - part_above
+            x = x_here - part_left * x_left - part_above * x_above
+            y = y_here - part_left * y_left - part_above * y_above
+            known = part_left * node[u64(_PLACE_LEFT) * w + k] + part_above * node[u64(_PLACE_ABOVE) * w + k]
+            mean = known + a0 * constant + a1 * x + a2 * y
+            spread, other_spread = f32(1.0) + curvature * here, f32(1.0) + other_curvature * here
+            precision, other_precision = curvature / spread, other_curvature / other_spread
+            off, other_off = place - mean, other_place - mean
+            one = height - f32(0.5) * (log(spread) + off * off * precision)
+            other = other_height - f32(0.5) * (log(other_spread) + other_off * other_off * other_precision)
+            high = larger(larger(one, other), larger(outliers, bad))
+            e, other_e, none, worse = exp(one - high), exp(other - high), exp(outliers - high), exp(bad - high)
+            both = e + other_e
+            total = larger((f32(1.0) - middle) * both + middle * worse + none, f32(1e-37))
+            if_few = larger((f32(1.0) - few) * both + few * worse + none, f32(1e-37))
+            if_many = larger((f32(1.0) - many) * both + many * worse + none, f32(1e-37))
+            high -= larger(larger(height, other_height), outliers)
+            node[(sums + u64(_LOGS)) * w + k] += high + log(if_few)
+            node[(sums + u64(_LOGS + 1)) * w + k] += high + log(total)
+            node[(sums + u64(_LOGS + 2)) * w + k] += high + log(if_many)
+            rest = (f32(1.0) - middle) / total
+            good, other_good = rest * e, rest * other_e
+            weight, other_weight = good * precision, other_good * other_precision
+            weights = weight + other_weight
+            pull = weight * (place - known) + other_weight * (other_place - known)
+            node[sums * w + k] += weights * constant * constant
+            node[(sums + u64(1)) * w + k] += weights * constant * x
+            node[(sums + u64(2)) * w + k] += weights * constant * y
+            node[(sums + u64(3)) * w + k] += weights * x * x
+            node[(sums + u64(4)) * w + k] += weights * x * y
+            node[(sums + u64(5)) * w + k] += weights * y * y
+            node[(sums + u64(_PULL)) * w + k] += pull * constant
+            node[(sums + u64(_PULL + 1)) * w + k] += pull * x
+            node[(sums + u64(_PULL + 2)) * w + k] += pull * y
+            tells = good * curvature / (f32(1.0) + curvature * variance)
+            other_tells = other_good * other_curvature / (f32(1.0) + other_curvature * variance)
+            told = tells + other_tells
+            node[u64(_TOLD) * w + k] = told
+            node[u64(_TOLD_PLACE) * w + k] = (tells * place + other_tells * other_place) / (told + f32(1e-6))
+        _keep_told(cells, c, full)
 
 
 @strict
@@ -222,7 +270,7 @@ def _solve(a, b):
 
 @strict
 def _log_of_shares(sums):
-    few, middle, many = sums[9] + _WEIGHTS[0], sums[10] + _WEIGHTS[1], sums[11] + _WEIGHTS[2]
+    few, middle, many = sums[_LOGS] + _WEIGHTS[0], sums[_LOGS + 1] + _WEIGHTS[1], sums[_LOGS + 2] + _WEIGHTS[2]
     high = max(few, max(middle, many))
     return high + np.log(np.exp(few - high) + np.exp(middle - high) + np.exp(many - high))
 
@@ -244,36 +292,65 @@ def _add_priors(sums, level, slope):
 
 
 @strict
-def find_shared_error(cells, s, most, count, scale, amplitudes, sums, a):
+def _put_node(cells, at, s, scale, amplitudes):
+    """Put a node into a slot."""
+    cells.pair[at] = s
+    cells.node[_VARIANCE * NODES_SIDE_BY_SIDE + at] = f32((scale * amplitudes.model) ** 2)
+    cells.node[_WAVES * NODES_SIDE_BY_SIDE + at] = f32((scale * amplitudes.wave) ** 2)
+
+
+@strict
+def _take_sums(cells, at):
+    for k in range(_NUMBERS):
+        cells.sums[k] = cells.node[(_SUMS + k) * NODES_SIDE_BY_SIDE + at]
+
+
+@strict
+def find_shared_error(cells, s, count, scale, amplitudes, a):
     """The mode of an object's shared error at one node, by reweighted steps, written to a: bias (m), slopes along x
     and y."""
-    variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
-    waves = f32((scale * amplitudes.wave) ** 2)
     level, slope = _priors(scale, amplitudes)
     a[0], a[1], a[2] = 0.0, 0.0, 0.0
     if level == 0:
         return
     for step in range(REWEIGHTED_STEPS):
-        _pass(cells, s, most, count, a, f32(variance + level) if step == 0 else variance, waves, share, sums)
-        _add_priors(sums, level, slope)
-        a[0], a[1], a[2], _ = _solve(sums, sums[6:9])
+        _put_node(cells, 0, s, scale, amplitudes)
+        cells.node[_VARIANCE * NODES_SIDE_BY_SIDE] += f32(level) if step == 0 else f32(0.0)
+        _pass(cells, count, 1, a, f32(amplitudes.bad_share))
+        _take_sums(cells, 0)
+        _add_priors(cells.sums, level, slope)
+        a[0], a[1], a[2], _ = _solve(cells.sums, cells.sums[_PULL:_LOGS])
 
 
 @strict
-def log_object(cells, s, most, count, scale, amplitudes, sums, a):
-    """log density of the cells of one object at one node, relative to `reference_height`. Its shared error is
-    integrated out by a paraboloid about a, which is near the mode."""
-    variance, share = f32((scale * amplitudes.model) ** 2), amplitudes.bad_share
-    level, slope = _priors(scale, amplitudes)
-    _pass(cells, s, most, count, a, variance, f32((scale * amplitudes.wave) ** 2), share, sums)
+def log_objects(cells, count, scales, amplitudes, a, values):
+    """log density of the cells of one object at every node, written to values: pairs of noise, and for each of them
+    the scales. The object's shared error is integrated out by a paraboloid about a, which is near the mode."""
+    nodes, levels = len(values), len(scales)
+    for first in range(0, nodes, NODES_SIDE_BY_SIDE):
+        used = min(nodes - first, NODES_SIDE_BY_SIDE)
+        for k in range(NODES_SIDE_BY_SIDE):  # slots beyond the last node repeat it
+            number = first + min(k, used - 1)
+            _put_node(cells, k, number // levels, scales[number % levels], amplitudes)
+        _pass(cells, count, used, a, f32(amplitudes.bad_share))
+        for k in range(used):
+            s, scale = (first + k) // levels, scales[(first + k) % levels]
+            _take_sums(cells, k)
+            values[first + k] = _reference_height(cells, s, count)
+            values[first + k] += _log_of_node(cells.sums, cells.pull, scale, amplitudes, a)
+
+
+@strict
+def _log_of_node(sums, pull, scale, amplitudes, a):
+    """log density of the cells of one object at one node, relative to `_reference_height`, from its sums."""
     value = _log_of_shares(sums)
+    level, slope = _priors(scale, amplitudes)
     if level == 0:
         return value
     _add_priors(sums, level, slope)
-    pull = sums[6:9]
-    pull[0] -= sums[0] * a[0] + sums[1] * a[1] + sums[2] * a[2]
-    pull[1] -= sums[1] * a[0] + sums[3] * a[1] + sums[4] * a[2]
-    pull[2] -= sums[2] * a[0] + sums[4] * a[1] + sums[5] * a[2]
+    pull[0] = sums[_PULL] - (sums[0] * a[0] + sums[1] * a[1] + sums[2] * a[2])
+    pull[1] = sums[_PULL + 1] - (sums[1] * a[0] + sums[3] * a[1] + sums[4] * a[2])
+    pull[2] = sums[_PULL + 2] - (sums[2] * a[0] + sums[4] * a[1] + sums[5] * a[2])
     x, y, z, log_determinant = _solve(sums, pull)
     return (
         value

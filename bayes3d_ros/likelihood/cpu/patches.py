@@ -32,6 +32,8 @@ class Returns(NamedTuple):
 
     bare: Float[np.ndarray, "H*W"]
     spread: Float[np.ndarray, "H*W"]
+    precision: Float[np.ndarray, "H*W"]  # of a return in units of the node's: |r|^2 / spread^2
+    root: Float[np.ndarray, "H*W"]  # of precision / 2 pi
     table_margin: Float[np.ndarray, "H*W"]
     own_plane: Float[np.ndarray, "S*H*W"]
     rows: int  # of the arrays
@@ -71,6 +73,18 @@ def new_patch(size):
 def new_scene_pixels(depth):
     none = np.zeros(len(depth), np.uint8)
     return ScenePixels(depth, none, none.copy(), none.copy(), none.copy())
+
+
+@fast
+def find_precisions(picture, spread, precision, root):
+    """`Returns.precision` and `Returns.root`."""
+    ray_x, ray_y, columns = picture.ray_x, picture.ray_y, u64(len(picture.ray_x))
+    for v in range(u64(len(ray_y))):
+        first, y = v * columns, ray_y[v]
+        for u in range(columns):
+            x, wide = ray_x[u], spread[first + u]
+            here = (f32(1.0) + x * x + y * y) / (wide * wide)
+            precision[first + u], root[first + u] = here, np.sqrt(here * f32(1 / (2 * np.pi)))
 
 
 @strict

@@ -9,23 +9,23 @@ from bayes3d_ros.likelihood.cpu.block_sums import score_blocks
 from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
 from bayes3d_ros.likelihood.cpu.cells import new_batch
 from bayes3d_ros.likelihood.cpu.compiling import handler, strict
-from bayes3d_ros.likelihood.cpu.edges import new_window
+from bayes3d_ros.likelihood.cpu.edges import new_edges
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
 from bayes3d_ros.likelihood.cpu.object_cells import (
     begin_object,
     find_neighbours,
     find_shared_error,
-    log_object,
+    log_objects,
     new_object_cells,
     place_cells,
-    reference_height,
 )
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
     Returns,
     begin_table,
     find_changes,
+    find_precisions,
     gather_rows,
     mask_nats,
     new_patch,
@@ -61,10 +61,10 @@ def _find_touched(changes, rectangle, block, stride, left, top, across, row, tou
 @strict
 def _gain_of(
     things, n, objects, picture, returns, scenes, scene_at, scene_stride, block, nodes, space, patch, now, former,
-    batch, own, work, sums, former_sums, gain, warp,
+    batch, own, work, former_sums, gain, warp,
 ):  # fmt: skip
     sigma, p_outlier, table, scale, amplitudes = nodes
-    fixed, old, touched, pixel_work, cell_work = work
+    fixed, old, touched, pixel_work, cell_work, of_cells, error = work
     known, former_fixed, former_old = former_sums
     border, tables, scales = 1, len(table), len(scale)
     height, width = len(picture.ray_y), len(picture.ray_x)
@@ -114,22 +114,20 @@ def _gain_of(
         for level in range(old.shape[1]):
             old[0, level] -= former_old[touched[k], level]
     metres = f32(metres / max(pixels, 1) / picture.focal_x)
-    error, most = sums[12:15], len(own.column)
+    pairs = len(sigma)
+    of_cells[:] = 0.0
     if new_cells > 0:
         column, row = place_cells(own, new_cells, metres)
-        find_neighbours(own, new_cells, block, f32(amplitudes.length))
-        for s in range(len(sigma)):
-            begin_object(own, s, most, new_cells, amplitudes.bad_share)
+        find_neighbours(own, new_cells, across, f32(amplitudes.length))
+        begin_object(own, new_cells, f32(amplitudes.bad_share))
         # One paraboloid for all nodes: about the mode at the middle one.
-        find_shared_error(own, len(sigma) // 2, most, new_cells, scale[scales // 2], amplitudes, sums, error)
+        find_shared_error(own, pairs // 2, new_cells, scale[scales // 2], amplitudes, error)
+        log_objects(own, new_cells, scale, amplitudes, error, of_cells)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
         warp[0] = error[0] - warp[1] * column - warp[2] * row
-    for s in range(len(sigma)):
-        level = reference_height(own, s, most, new_cells) if new_cells > 0 else 0.0
+    for s in range(pairs):
         for a in range(scales):
-            value = old[0, s * scales + a] + level
-            if new_cells > 0:
-                value += log_object(own, s, most, new_cells, scale[a], amplitudes, sums, error)
+            value = old[0, s * scales + a] + of_cells[s * scales + a]
             for t in range(tables):
                 gain[(s * tables + t) * scales + a] = value + fixed[0, s * tables + t]
 
@@ -148,8 +146,11 @@ def _shared_gain(frame):
     things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 26)
     block, scene_rows, scene_columns, own_rows = whole[0], whole[1], whole[2], whole[3]
     picture = picture_of(frame, own_rows)
+    spread = floats(frame, 18)
+    precision, root = np.zeros(len(spread), np.float32), np.zeros(len(spread), np.float32)
+    find_precisions(picture, spread, precision, root)
     returns = Returns(
-        floats(frame, 17), floats(frame, 18), floats(frame, 19), floats(frame, 20), len(floats(frame, 13)),
+        floats(frame, 17), spread, precision, root, floats(frame, 19), floats(frame, 20), len(floats(frame, 13)),
         len(picture.ray_x),
     )  # fmt: skip
     nodes = nodes_of(frame, 21)
@@ -165,13 +166,14 @@ def _shared_gain(frame):
     own = new_object_cells(pairs, blocks)
     work = (
         np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
-        (new_window(nodes.amplitudes.edge_blur), np.zeros(pairs, np.float32)),
+        (new_edges(), np.zeros(pairs, np.float32)),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
+        np.zeros(pairs * scales), np.zeros(3),
     )  # fmt: skip
     former_sums = (
         np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
     )  # fmt: skip
-    sums, levels, last = np.zeros(15), pairs * tables * scales, -1
+    levels, last = pairs * tables * scales, -1
     for k in range(len(gain)):
         gain[k] = f32(0)
     for k in range(len(warp)):
@@ -182,7 +184,7 @@ def _shared_gain(frame):
             last = ancestor[n]
         _gain_of(
             things, n, objects, picture, returns, scenes, ancestor[n] * scene_rows * scene_columns, scene_columns,
-            block, nodes, space, patch, now, former, batch, own, work, sums, former_sums,
+            block, nodes, space, patch, now, former, batch, own, work, former_sums,
             gain[n * levels : (n + 1) * levels], warp[n * WARP : (n + 1) * WARP],
         )  # fmt: skip
     return 0
