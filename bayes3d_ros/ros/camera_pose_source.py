@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from bayes3d_ros.ros.from_messages import matrix_from_values, pose_to_matrix, stamp_to_ns
 from bayes3d_ros.ros.input_topics import POSE_INPUT
-from bayes3d_ros.ros.parameters import DepthInputSettings
+from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses

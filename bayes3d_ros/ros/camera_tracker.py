@@ -26,11 +26,7 @@ from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
-from bayes3d_ros.ros.parameters import (
-    CAMERA_TRACKER_SETTINGS,
-    DEPTH_INPUT_PARAMETERS,
-    CameraTrackerNodeSettings,
-)
+from bayes3d_ros.ros.node_settings import CAMERA_TRACKER_SETTINGS, DEPTH_INPUT_PARAMETERS, CameraTrackerNodeSettings
 from bayes3d_ros.ros.qos import RELIABLE
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.to_messages import camera_particles, camera_pose_message

@@ -18,7 +18,7 @@ from bayes3d_ros.ros.diagnostics import InputView, TopicView
 from bayes3d_ros.ros.from_messages import frame_from_messages, stamp_to_ns
 from bayes3d_ros.ros.input_queue import InputQueue
 from bayes3d_ros.ros.input_topics import INFO_INPUT
-from bayes3d_ros.ros.parameters import DepthInputSettings
+from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.subscriptions import AutoSubscription
 
 _LOOK = 0.2  # seconds between two looks at who publishes

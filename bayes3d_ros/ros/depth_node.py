@@ -23,7 +23,8 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import Health, InputView, judge, judge_on_request, one_line
-from bayes3d_ros.ros.parameters import DepthInputSettings, SettingsParameters
+from bayes3d_ros.ros.node_settings import DepthInputSettings
+from bayes3d_ros.ros.parameters import SettingsParameters
 from bayes3d_ros.ros.worker import NewestWorker
 
 _REPORT_PERIOD = 1.0  # seconds between two messages on /diagnostics

@@ -43,12 +43,8 @@ from bayes3d_ros.ros.diagnostics import (
     why_no_input,
 )
 from bayes3d_ros.ros.from_messages import stamp_to_ns
-from bayes3d_ros.ros.parameters import (
-    DEPTH_INPUT_PARAMETERS,
-    OBJECT_LEARNER_SETTINGS,
-    ObjectLearnerNodeSettings,
-    Settings,
-)
+from bayes3d_ros.ros.node_settings import DEPTH_INPUT_PARAMETERS, OBJECT_LEARNER_SETTINGS, ObjectLearnerNodeSettings
+from bayes3d_ros.ros.parameters import Settings
 from bayes3d_ros.ros.qos import LATCHED
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.summary import key_values

@@ -13,7 +13,7 @@ from bayes3d_ros.posterior.output_frame import OutputFrame
 from bayes3d_ros.posterior.reframe import table_frame
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_pose_source import CameraPose
-from bayes3d_ros.ros.parameters import SceneParserNodeSettings
+from bayes3d_ros.ros.node_settings import SceneParserNodeSettings
 from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
 
 TABLE = "table"  # as output_frame: the table's frame, whatever `table_frame` calls it

@@ -23,7 +23,7 @@ from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.markers import SceneMarkers
 from bayes3d_ros.ros.message_definitions import MessageDefinitions, type_name
-from bayes3d_ros.ros.parameters import CameraTrackerNodeSettings
+from bayes3d_ros.ros.node_settings import CameraTrackerNodeSettings
 from bayes3d_ros.ros.scene_outputs import ToldScene, scene_outputs
 from bayes3d_ros.ros.to_messages import (
     camera_particles,

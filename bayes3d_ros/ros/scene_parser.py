@@ -22,9 +22,7 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView, one_line
-from bayes3d_ros.ros.object_transforms import ObjectTransforms
-from bayes3d_ros.ros.output_frames import OutputFrames
-from bayes3d_ros.ros.parameters import (
+from bayes3d_ros.ros.node_settings import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
     ON_REQUEST,
@@ -32,6 +30,8 @@ from bayes3d_ros.ros.parameters import (
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
+from bayes3d_ros.ros.object_transforms import ObjectTransforms
+from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parse_requests import ParseAnswer
 from bayes3d_ros.ros.parse_service import ParseService
 from bayes3d_ros.ros.parser_bundle import LEAST_CAPACITY, MakeParser, ParserBundle, make_bundle, types_of

@@ -21,8 +21,8 @@ from bayes3d_ros.ros import output_frames, tf_poses
 from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose
 from bayes3d_ros.ros.demo import OUTPUTS
 from bayes3d_ros.ros.from_messages import pose_to_matrix, rows_from_cloud, transform_to_matrix
+from bayes3d_ros.ros.node_settings import SceneParserNodeSettings
 from bayes3d_ros.ros.output_frames import OutputFrames
-from bayes3d_ros.ros.parameters import SceneParserNodeSettings
 
 IN_THE_CAMERA = {"segmentation", "depth_reconstruction", "unknown_points", "T_camera_table"}
 CAMERA_POSE = "[0.2, -0.7, 0.6, 0.90112711, 0.0, 0.0, -0.43355763]"  # looks down at the table

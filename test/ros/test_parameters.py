@@ -12,15 +12,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bayes3d_ros.resources import share_directory
-from bayes3d_ros.ros.parameters import (
+from bayes3d_ros.ros.node_settings import (
     NODE_SETTINGS,
     OBJECT_LEARNER_SETTINGS,
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
-    SettingsParameters,
-    describe,
-    yaml_text,
 )
+from bayes3d_ros.ros.parameters import SettingsParameters, describe, yaml_text
 from bayes3d_ros.settings import RETIRED, LearnerSettings, ParserSettings
 
 

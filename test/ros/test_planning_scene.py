@@ -25,7 +25,7 @@ from bayes3d_ros.posterior.collision_scene import SceneChanges, obstacles_of
 from bayes3d_ros.posterior.reframe import in_frame, table_frame
 from bayes3d_ros.ros import planning_scene
 from bayes3d_ros.ros.from_messages import pose_to_matrix, stamp_to_ns
-from bayes3d_ros.ros.parameters import SceneParserNodeSettings
+from bayes3d_ros.ros.node_settings import SceneParserNodeSettings
 from bayes3d_ros.ros.planning_scene import CollisionMeshes, PlanningScenePublisher, mesh_message
 
 HERE = Path(__file__).parent
