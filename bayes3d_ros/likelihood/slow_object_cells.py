@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """The cells of one object, in float64 and as `shared_errors.py` defines them: their joint likelihood, with the shared
-error integrated out and each cell given the waves in the cells beside it. The reference of `cpu/object_cells.py`."""
+error integrated out and each cell given the waves in the cells beside it. The reference of `cpu/object_density.py`."""
 
 from typing import NamedTuple
 

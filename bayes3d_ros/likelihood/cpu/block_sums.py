@@ -94,7 +94,7 @@ def _add_cells(batch, used, label, sums, column):
 
 
 @strict
-def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
+def _weigh(batch, used, returns, own, new_cells, nodes, fixed, old):
     """Add the batch's cells to sums; keep those of the new object. Returns how many cells are kept now."""
     sigma, p_outlier, table, scale, amplitudes = nodes
     w, pairs, tables, scales = CELLS_SIDE_BY_SIDE, len(sigma), len(table), len(scale)
@@ -122,9 +122,9 @@ def _weigh(batch, used, returns, own, most, new_cells, nodes, fixed, old):
                 continue
             at = kept * pairs + s
             for which in range(2):
-                own.height[which * most * pairs + at] = batch.height[which * w + c]
-                own.place[which * most * pairs + at] = batch.place[which * w + c]
-                own.curvature[which * most * pairs + at] = batch.curvature[which * w + c]
+                own.height[which * len(own.outliers) + at] = batch.height[which * w + c]
+                own.place[which * len(own.outliers) + at] = batch.place[which * w + c]
+                own.curvature[which * len(own.outliers) + at] = batch.curvature[which * w + c]
             own.outliers[at], own.bad[at] = batch.outliers[c], batch.own_plane[s * w + c]
             own.block[kept], own.number[kept] = batch.block[c], batch.number[c]
             own.column[kept], own.row[kept] = batch.column[c], batch.row[c]
@@ -174,7 +174,7 @@ def score_blocks(
     """Add the log likelihoods of blocks to rows of sums: each block to its own row, or, with `one_row`, all to the
     first. Returns how many cells of the new object were kept."""
     height, width = len(picture.ray_y), len(picture.ray_x)
-    across, most, returns_a_cell = (width + block - 1) // block, len(own.column), block * block
+    across, returns_a_cell = (width + block - 1) // block, block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
     edges, values = work
     used, new_cells, edges_used = 0, 0, 0
@@ -196,10 +196,10 @@ def score_blocks(
             )  # fmt: skip
             used += 1
             if used == CELLS_SIDE_BY_SIDE:
-                new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+                new_cells = _weigh(batch, used, returns_a_cell, own, new_cells, nodes, fixed, old)
                 used = 0
                 _clear(batch, returns_a_cell)
     add_edges(edges, edges_used, picture, scene.depth, scene.label, stride, nodes, fixed)
     if used > 0:
-        new_cells = _weigh(batch, used, returns_a_cell, own, most, new_cells, nodes, fixed, old)
+        new_cells = _weigh(batch, used, returns_a_cell, own, new_cells, nodes, fixed, old)
     return new_cells

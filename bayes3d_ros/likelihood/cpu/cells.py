@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """Cells of pixels that share an error, many side by side: the likelihood of their returns as a function of that error,
-and integrated over it. `object_cells.py` combines the cells of an object.
+and integrated over it. `object_density.py` combines the cells of an object.
 
 The densities are those of `likelihood/slow_cells.py`, written again in scalars; tests compare them.
 """

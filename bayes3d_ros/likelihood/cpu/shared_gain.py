@@ -12,14 +12,8 @@ from bayes3d_ros.likelihood.cpu.compiling import handler, strict
 from bayes3d_ros.likelihood.cpu.edges import new_edges
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
-from bayes3d_ros.likelihood.cpu.object_cells import (
-    begin_object,
-    find_neighbours,
-    find_shared_error,
-    log_objects,
-    new_object_cells,
-    place_cells,
-)
+from bayes3d_ros.likelihood.cpu.object_cells import begin_object, find_neighbours, new_object_cells, place_cells
+from bayes3d_ros.likelihood.cpu.object_density import find_shared_error, log_objects, new_node_rows
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
     Returns,
@@ -64,7 +58,7 @@ def _gain_of(
     batch, own, work, former_sums, gain, warp,
 ):  # fmt: skip
     sigma, p_outlier, table, scale, amplitudes = nodes
-    fixed, old, touched, pixel_work, cell_work, of_cells, error = work
+    fixed, old, touched, pixel_work, cell_work, rows, of_cells, error = work
     known, former_fixed, former_old = former_sums
     border, tables, scales = 1, len(table), len(scale)
     height, width = len(picture.ray_y), len(picture.ray_x)
@@ -121,8 +115,8 @@ def _gain_of(
         find_neighbours(own, new_cells, across, f32(amplitudes.length))
         begin_object(own, new_cells, f32(amplitudes.bad_share))
         # One paraboloid for all nodes: about the mode at the middle one.
-        find_shared_error(own, pairs // 2, new_cells, scale[scales // 2], amplitudes, error)
-        log_objects(own, new_cells, scale, amplitudes, error, of_cells)
+        find_shared_error(own, rows, pairs // 2, new_cells, scale[scales // 2], amplitudes, error)
+        log_objects(own, rows, new_cells, scale, amplitudes, error, of_cells)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
         warp[0] = error[0] - warp[1] * column - warp[2] * row
     for s in range(pairs):
@@ -168,7 +162,7 @@ def _shared_gain(frame):
         np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
         (new_edges(), np.zeros(pairs, np.float32)),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
-        np.zeros(pairs * scales), np.zeros(3),
+        new_node_rows(blocks), np.zeros(pairs * scales), np.zeros(3),
     )  # fmt: skip
     former_sums = (
         np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
