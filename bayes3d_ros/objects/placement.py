@@ -48,13 +48,6 @@ def in_region(x: float, y: float, table: Table) -> bool:
     return bool(left <= x <= right and front <= y <= back)
 
 
-def moved_into_region(placement: Placement, table: Table) -> Placement:
-    """The nearest placements whose box centre lies in the region."""
-    low, high = table.region
-    x, y = jnp.clip(placement.x, low[0], high[0]), jnp.clip(placement.y, low[1], high[1])
-    return placement._replace(x=x, y=y)
-
-
 def left_out(placement: Placement, library: LibraryArrays, table: Table) -> Bool[Array, "*batch"]:
     """Whether an object is of a type that is not possible, or stands outside the region."""
     low, high = table.region
@@ -73,6 +66,13 @@ def room(
     lowest, highest = table.region
     low = jnp.minimum(jnp.maximum(-half, lowest), highest - LEAST_ROOM)
     return low, jnp.maximum(jnp.minimum(half, highest), low + LEAST_ROOM)
+
+
+def moved_into_room(placement: Placement, library: LibraryArrays, table: Table) -> Placement:
+    """The nearest placements whose box centre the prior allows."""
+    low, high = room(placement.type, placement.face, library, table)
+    x, y = jnp.clip(placement.x, low[..., 0], high[..., 0]), jnp.clip(placement.y, low[..., 1], high[..., 1])
+    return placement._replace(x=x, y=y)
 
 
 def T_table_object(placement: Placement, library: LibraryArrays) -> Float[Array, "*batch 4 4"]:

@@ -20,7 +20,7 @@ from bayes3d_ros.likelihood.noise_marginal import NoiseGrid, near_peak
 from bayes3d_ros.likelihood.scene_score import log_likelihood_gain
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.objects.library_arrays import NUM_FACES, SURFACE_SAMPLES, LibraryArrays
-from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_into_region, overlap
+from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_into_room, overlap
 from bayes3d_ros.objects.self_symmetry import TURNED
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
@@ -126,7 +126,8 @@ def candidates(
     x, y = cells.centre[cell].T
     placement = Placement(type_id, face, x, y, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
     placement, information = align(placement, returns, image, library, table)
-    placement = moved_into_region(placement, table)  # what stands across its border is seen to stand outside
+    # Alignment carries an object at the border of the table, or of the region, across the border.
+    placement = moved_into_room(placement, library, table)
     loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
     found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
     score = surface_score(

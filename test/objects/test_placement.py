@@ -18,7 +18,7 @@ from bayes3d_ros.objects.placement import (
     Table,
     in_region,
     log_prior,
-    moved_into_region,
+    moved_into_room,
     overlap,
     room,
 )
@@ -162,10 +162,20 @@ def test_what_lies_in_the_region(arrays):
     table = table_of(0.5, 0.4)._replace(region=np.array([[-0.1, 0.0], [0.1, 0.2]]))
     x, y = np.array([0.0, -0.2, 0.05, 0.0]), np.array([0.1, 0.1, 0.3, -0.1])
     assert [in_region(*place, table) for place in zip(x, y, strict=True)] == [True, False, False, False]
-    moved = moved_into_region(placement(BOX, 0, x, y), table)
-    np.testing.assert_allclose(moved.x, [0, -0.1, 0.05, 0], rtol=1e-6)
-    np.testing.assert_allclose(moved.y, [0.1, 0.1, 0.2, 0], rtol=1e-6)
     assert in_region(0.3, -0.3, table_of(0.5, 0.4))
+
+
+def test_placements_move_to_the_nearest_place_that_the_prior_allows(arrays):
+    rng = np.random.default_rng(3)
+    anywhere = placement(KINDS, FACES, *rng.uniform(-0.25, 0.25, (2, len(KINDS))))
+    for region in (table_of(0.5, 0.4).region, np.array([[-0.1, 0.0], [0.1, 0.2]], np.float32)):
+        table = table_of(0.5, 0.4)._replace(region=region)
+        moved = moved_into_room(anywhere, arrays, table)
+        assert np.isfinite(log_prior(moved, arrays, table)).all()
+        allowed = np.isfinite(log_prior(anywhere, arrays, table))
+        assert allowed.any() and not allowed.all()
+        for axis in "xy":
+            np.testing.assert_array_equal(*(np.asarray(getattr(a, axis))[allowed] for a in (moved, anywhere)))
 
 
 def test_the_prior_is_uniform_inside_and_nothing_outside(arrays, library):
