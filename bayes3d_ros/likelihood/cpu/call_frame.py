@@ -22,23 +22,26 @@ import numpy as np
 VERSION = (0, 1)  # of the interface, major and minor, that the handlers tell XLA they were written for
 METADATA = 1  # XLA_FFI_Extension_Metadata: the type of the extension of a frame that asks for the version
 VERSION_WORD = 3  # of XLA_FFI_Metadata: the 64-bit word that holds major and minor
-ARGUMENTS_WORD, RESULTS_WORD = 5, 10  # of XLA_FFI_CallFrame: where XLA_FFI_Args and XLA_FFI_Rets begin
+API_WORD, CONTEXT_WORD = 2, 3  # of XLA_FFI_CallFrame
+ARGUMENTS_WORD, RESULTS_WORD = 5, 10  # where XLA_FFI_Args and XLA_FFI_Rets begin
+SCHEDULE_WORD, THREADS_WORD = 17, 18  # of XLA_FFI_Api: XLA_FFI_ThreadPool_Schedule, XLA_FFI_ThreadPool_NumThreads
 
 
 class Layout(NamedTuple):
     """What a handler can see of the interface's layout: the major version, and sizes in bytes. A later minor version
-    may add fields, which changes a size, or functions, which are not called."""
+    may add fields, which changes a size, or functions after those that are called."""
 
     call_frame: int
     arguments: int
     results: int
     api_version: int
     major: int
+    pool: bool  # whether XLA lends its threads
     buffer: int
 
 
 # Versions 0.1 to 0.5; the last is that of jaxlib 0.12.
-EXPECTED = Layout(call_frame=168, arguments=40, results=40, api_version=24, major=VERSION[0], buffer=48)
+EXPECTED = Layout(call_frame=168, arguments=40, results=40, api_version=24, major=VERSION[0], pool=True, buffer=48)
 
 _CALL_FRAME = "bayes3d_call_frame"  # to XLA
 _one_at_a_time = threading.Lock()
@@ -100,9 +103,10 @@ def _look(frame: int) -> Iterator[tuple[str, int]]:
     yield "call_frame", _word(frame, 0)
     yield "arguments", _word(frame, ARGUMENTS_WORD)
     yield "results", _word(frame, RESULTS_WORD)
-    version = _word(frame, 2) + 16  # in XLA_FFI_Api, after its size and extension
+    version = _word(frame, API_WORD) + 16  # in XLA_FFI_Api, after its size and extension
     yield "api_version", _word(version, 0)
     yield "major", _word(version, 2) & 0xFFFFFFFF
+    yield "pool", _word(_word(frame, API_WORD), 0) >= 8 * (THREADS_WORD + 1)
     yield "buffer", _word(_word(_word(frame, ARGUMENTS_WORD + 4), 0), 0)
 
 

@@ -79,3 +79,4 @@ inlined = kept(
     njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath=_FASTMATH, inline="always")  # type: ignore[call-overload]
 )
 handler = kept(cfunc(types.int64(types.int64), cache=True))  # of XLA's calls, frame to error
+task = kept(cfunc(types.void(types.int64), cache=True))  # of XLA's thread pool, given a job

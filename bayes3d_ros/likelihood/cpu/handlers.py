@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Loops that numba compiles, as XLA calls them on CPUs: they render and score hypotheses one after the other."""
+"""Loops that numba compiles, as XLA calls them on CPUs: they render and score hypotheses one after the other, in parts
+that threads share (`sharing.py`)."""
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from bayes3d_ros.likelihood.cpu.buffers import (
     new_space,
     new_windows,
 )
-from bayes3d_ros.likelihood.cpu.compiling import handler, inlined, strict
+from bayes3d_ros.likelihood.cpu.compiling import allocating, handler, inlined, strict, task
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.rays import render_object, render_plane
+from bayes3d_ros.likelihood.cpu.sharing import address_of, begin_job, finish, frame_of, leave, next_part, part_done
 from bayes3d_ros.likelihood.cpu.windows import (
     begin_ends,
     begin_patch,
@@ -50,13 +52,12 @@ def _render_planes(plane, picture, patch, stride, shift):
 
 @strict
 def _gains(
-    things, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier, weight, window, everywhere, metres, share,
-    gain, space, windows, now, former
+    part, things, planes, picture, scenes, scene_shape, ancestor, sigma, p_outlier, weight, window, everywhere, metres,
+    share, gain, space, windows, now, former,
 ):  # fmt: skip
-    count, border = len(planes) // 4, window // 2
-    objects, levels = objects_each(things, planes), len(sigma) * len(p_outlier)
+    border, objects, levels = window // 2, objects_each(things, planes), len(sigma) * len(p_outlier)
     with_scenes = len(scenes) > 0
-    for n in range(count):
+    for n in range(part[0], part[1]):
         plane = planes[4 * n : 4 * n + 4]
         flat = everywhere and _is_plane(plane)
         rectangle = find_outlines(things, n, objects, picture, space)
@@ -102,12 +103,12 @@ def _gains(
 
 
 @strict
-def _depths(things, planes, picture, start, rows, columns, border, everywhere, depth, space):
+def _depths(part, things, planes, picture, start, rows, columns, border, everywhere, depth, space):
     """Images of rows x columns pixels, of which `border` lie before the camera's first: those that there are to start
     with, or none, and what each hypothesis adds."""
-    count, pixels, shift = len(planes) // 4, rows * columns, border * columns + border
+    pixels, shift = rows * columns, border * columns + border
     objects = objects_each(things, planes)
-    for n in range(count):
+    for n in range(part[0], part[1]):
         image = depth[n * pixels : (n + 1) * pixels]
         for k in range(pixels):
             image[k] = min(start[n * pixels + k], f32(NO_SURFACE_METRES)) if len(start) > 0 else f32(NO_SURFACE_METRES)
@@ -150,43 +151,85 @@ def picture_of(frame, own_rows):
     )  # fmt: skip
 
 
-@handler
-def _gain(frame):
-    """See `gain.compiled_gain`."""
-    if answered_version(frame):
-        return 0
+@allocating
+def _gain_parts(frame, job):
+    """Take parts of the call, one after the other, until none is left. See `gain.compiled_gain`."""
+    part = next_part(job)
+    if part[0] == part[1]:
+        return
     things, planes, sigma = things_of(frame), floats(frame, 9), floats(frame, 17)
     numbers, settings = floats(frame, 14), integers(frame, 19)
     window = settings[0]
     picture = picture_of(frame, settings[4])
-    _gains(
-        things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma, floats(frame, 18),
-        numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
-        new_space(
-            len(picture.ray_y), len(picture.ray_x), window // 2, objects_each(things, planes), most_corners(things)
-        ),
-        new_windows(window * window),
-        np.zeros(len(sigma) * WINDOWS_SIDE_BY_SIDE, np.float32),
-        np.zeros(len(sigma) * WINDOWS_SIDE_BY_SIDE, np.float32),
-    )  # fmt: skip
-    return 0
+    space = new_space(
+        len(picture.ray_y), len(picture.ray_x), window // 2, objects_each(things, planes), most_corners(things)
+    )
+    windows = new_windows(window * window)
+    now = np.zeros(len(sigma) * WINDOWS_SIDE_BY_SIDE, np.float32)
+    former = np.zeros(len(sigma) * WINDOWS_SIDE_BY_SIDE, np.float32)
+    while part[0] < part[1]:
+        _gains(
+            part, things, planes, picture, floats(frame, 15), settings[2:4], integers(frame, 16), sigma,
+            floats(frame, 18), numbers[6], window, settings[1] != 0, numbers[7], numbers[8], float_results(frame, 0),
+            space, windows, now, former,
+        )  # fmt: skip
+        part_done(job)
+        part = next_part(job)
 
 
-@handler
-def _depth(frame):
-    """See `gain.compiled_depth`."""
-    if answered_version(frame):
-        return 0
+@allocating
+def _depth_parts(frame, job):
+    """The same for `gain.compiled_depth`."""
+    part = next_part(job)
+    if part[0] == part[1]:
+        return
     things, planes = things_of(frame), floats(frame, 9)
     numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
         start, things.type_id, floats(frame, 10), floats(frame, 11)[: shape[4]],
         numbers[0], numbers[1], numbers[2], numbers[3], f32(0.0), f32(0.0),
     )  # fmt: skip
-    _depths(
-        things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
-        new_space(len(picture.ray_y), len(picture.ray_x), 0, objects_each(things, planes), most_corners(things)),
-    )  # fmt: skip
+    space = new_space(len(picture.ray_y), len(picture.ray_x), 0, objects_each(things, planes), most_corners(things))
+    while part[0] < part[1]:
+        _depths(
+            part, things, planes, picture, start, shape[0], shape[1], shape[2], shape[3] != 0, float_results(frame, 0),
+            space,
+        )  # fmt: skip
+        part_done(job)
+        part = next_part(job)
+
+
+@task
+def _help_gain(job):
+    _gain_parts(frame_of(job), job)
+    leave(job)
+
+
+@task
+def _help_depth(job):
+    _depth_parts(frame_of(job), job)
+    leave(job)
+
+
+_help_gain_address = address_of("bayes3d_help_gain", _help_gain)
+_help_depth_address = address_of("bayes3d_help_depth", _help_depth)
+
+
+@handler
+def _gain(frame):
+    if not answered_version(frame):
+        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_gain_address())
+        _gain_parts(frame, job)
+        finish(job)
+    return 0
+
+
+@handler
+def _depth(frame):
+    if not answered_version(frame):
+        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_depth_address())
+        _depth_parts(frame, job)
+        finish(job)
     return 0
 
 

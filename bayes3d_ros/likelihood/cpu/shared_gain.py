@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gain of hypotheses under `likelihood/shared_errors.py`: rendered and scored one after the other by loops that
-numba compiles, as XLA calls them on CPUs."""
+"""The gain of hypotheses under `likelihood/shared_errors.py`: rendered and scored by loops that numba compiles, as XLA
+calls them on CPUs."""
 
 import numpy as np
 
 from bayes3d_ros.likelihood.cpu.block_sums import score_blocks
 from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
 from bayes3d_ros.likelihood.cpu.cells import new_batch
-from bayes3d_ros.likelihood.cpu.compiling import handler, strict
+from bayes3d_ros.likelihood.cpu.compiling import allocating, handler, strict, task
 from bayes3d_ros.likelihood.cpu.edges import new_edges
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
@@ -26,6 +26,7 @@ from bayes3d_ros.likelihood.cpu.patches import (
     new_scene_pixels,
     sort_scene,
 )
+from bayes3d_ros.likelihood.cpu.sharing import address_of, begin_job, finish, frame_of, leave, next_part, part_done
 from bayes3d_ros.likelihood.cpu.windows import begin_patch, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
@@ -132,11 +133,12 @@ def _forget(former_sums):
     known[:], fixed[:], old[:] = 0, 0.0, 0.0
 
 
-@handler
-def _shared_gain(frame):
-    """See `gain.shared_gain`."""
-    if answered_version(frame):
-        return 0
+@allocating
+def _score_parts(frame, job):
+    """Take parts of the call, one after the other, until none is left. See `gain.shared_gain`."""
+    begin, end = next_part(job)
+    if begin == end:
+        return
     things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 26)
     block, scene_rows, scene_columns, own_rows = whole[0], whole[1], whole[2], whole[3]
     picture = picture_of(frame, own_rows)
@@ -150,7 +152,7 @@ def _shared_gain(frame):
     nodes = nodes_of(frame, 21)
     scenes, ancestor = floats(frame, 15), integers(frame, 16)
     gain, warp = float_results(frame, 0), float_results(frame, 1)
-    count, objects = len(planes) // 4, objects_each(things, planes)
+    objects = objects_each(things, planes)
     height, width = len(picture.ray_y), len(picture.ray_x)
     space = new_space(height, width, 1, objects, most_corners(things))
     pairs, tables, scales = len(nodes.sigma), len(nodes.table), len(nodes.scale)
@@ -168,19 +170,37 @@ def _shared_gain(frame):
         np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
     )  # fmt: skip
     levels, last = pairs * tables * scales, -1
-    for k in range(len(gain)):
-        gain[k] = f32(0)
-    for k in range(len(warp)):
-        warp[k] = f32(0)
-    for n in range(count):
-        if ancestor[n] != last:
-            _forget(former_sums)
-            last = ancestor[n]
-        _gain_of(
-            things, n, objects, picture, returns, scenes, ancestor[n] * scene_rows * scene_columns, scene_columns,
-            block, nodes, space, patch, now, former, batch, own, work, former_sums,
-            gain[n * levels : (n + 1) * levels], warp[n * WARP : (n + 1) * WARP],
-        )  # fmt: skip
+    while begin < end:
+        for n in range(begin, end):
+            if ancestor[n] != last:
+                _forget(former_sums)
+                last = ancestor[n]
+            gain_here, warp_here = gain[n * levels : (n + 1) * levels], warp[n * WARP : (n + 1) * WARP]
+            gain_here[:], warp_here[:] = f32(0), f32(0)
+            _gain_of(
+                things, n, objects, picture, returns, scenes, ancestor[n] * scene_rows * scene_columns, scene_columns,
+                block, nodes, space, patch, now, former, batch, own, work, former_sums, gain_here, warp_here,
+            )  # fmt: skip
+        part_done(job)
+        begin, end = next_part(job)
+
+
+@task
+def _help(job):
+    _score_parts(frame_of(job), job)
+    leave(job)
+
+
+_help_address = address_of("bayes3d_help_shared_gain", _help)
+
+
+@handler
+def _shared_gain(frame):
+    """See `gain.shared_gain`."""
+    if not answered_version(frame):
+        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_address())
+        _score_parts(frame, job)
+        finish(job)
     return 0
 
 

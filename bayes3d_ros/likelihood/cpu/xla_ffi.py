@@ -31,17 +31,18 @@ def _pointer(context, address):
 
 
 @kept(njit("int64[::1](int64, int64)", cache=True))
-def _words(address, count):
+def words(address, count):
+    """64-bit words at an address."""
     return carray(_pointer(address), (count,), np.int64)
 
 
 @kept(njit("boolean(int64)", cache=True))
 def answered_version(frame):
     """Whether XLA only asks which version of its interface this is; then it has been told."""
-    extension = _words(frame, _FRAME)[_EXTENSION]
+    extension = words(frame, _FRAME)[_EXTENSION]
     if extension == 0:
         return False
-    fields = _words(extension, 4)  # size, type (32 bits), next, metadata
+    fields = words(extension, 4)  # size, type (32 bits), next, metadata
     if (fields[1] & 0xFFFFFFFF) != METADATA:
         return False
     version = carray(_pointer(fields[3] + 8 * VERSION_WORD), (2,), np.int32)
@@ -52,8 +53,8 @@ def answered_version(frame):
 @kept(njit("UniTuple(int64, 2)(int64, int64, int64)", cache=True))
 def _buffer(frame, where, k):
     """Address and number of elements of the k-th argument or result."""
-    buffer = _words(_words(_words(frame, _FRAME)[where], k + 1)[k], _BUFFER)
-    count, dims = 1, _words(buffer[_DIMS], buffer[_RANK])
+    buffer = words(words(words(frame, _FRAME)[where], k + 1)[k], _BUFFER)
+    count, dims = 1, words(buffer[_DIMS], buffer[_RANK])
     for axis in range(buffer[_RANK]):
         count *= dims[axis]
     return buffer[_DATA], count
