@@ -156,7 +156,7 @@ class SceneParser:
         fixed = settings.fixed_objects >= 0
         last = settings.fixed_objects if fixed else settings.max_objects
         state = self._empty(context, model)
-        stages: list[Stage] = []
+        states: list[smc.Population] = []
         ess, log_mass = [], [0.0]
         for count in range(last):
             before = state
@@ -172,17 +172,35 @@ class SceneParser:
             )
             ess.append(float(info.ess))
             log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
-            matters = log_mass[-2] > log_mass[-1] + LEAST_LOG_WEIGHT
             if log_mass[-2] == max(log_mass):
                 before = self._refreshed(key, before, count, context, model)
-            keep_key = jax.random.fold_in(key, 1000 + count)
-            stages.append(self._keep(keep_key, before, count, model, seen if matters else None, matters))
+            states.append(before)
             if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + LEAST_LIKELY_COUNT):
                 break
         if log_mass[-1] == max(log_mass):
             state = self._refreshed(key, state, len(ess), context, model)
-        stages.append(self._keep(jax.random.fold_in(key, 1000 + last), state, len(ess), model, seen))
-        return stages, ess
+        return self._stages(key, [*states, state], log_mass, model, seen), ess
+
+    def _stages(
+        self,
+        key: PRNGKeyArray,
+        states: list[smc.Population],
+        log_mass: list[float],
+        model: ImageModel,
+        seen: Observation | None,
+    ) -> list[Stage]:
+        """What is kept of each number of known objects: of those with negligible mass the evidence alone. Unknown
+        things hardly raise a stage's mass, and lower it by thousands of nats where there is no room for them: so
+        stages are looked at by falling mass, until the next one is negligible whatever its things are."""
+        settings = self.settings
+        stages = [Stage.without_scenes(float(s.log_evidence), max(settings.max_objects, 1)) for s in states]
+        only_last = settings.fixed_objects >= 0 and not settings.knows_unknown
+        best = -np.inf
+        for count in [len(states) - 1] if only_last else np.argsort(-np.array(log_mass), kind="stable").tolist():
+            if log_mass[count] > best + LEAST_LOG_WEIGHT:
+                stages[count] = self._keep(jax.random.fold_in(key, 1000 + count), states[count], count, model, seen)
+                best = max(best, stages[count].log_evidence + count * np.log(settings.count_ratio))
+        return stages
 
     def _empty(self, context: Context, model: ImageModel) -> smc.Population:
         settings = self.settings
@@ -206,19 +224,10 @@ class SceneParser:
         return state
 
     def _keep(
-        self,
-        key: PRNGKeyArray,
-        state: smc.Population,
-        count: int,
-        model: ImageModel,
-        seen: Observation | None,
-        matters: bool = True,
+        self, key: PRNGKeyArray, state: smc.Population, count: int, model: ImageModel, seen: Observation | None
     ) -> Stage:
-        """The scenes of `count` known objects, with noise and unknown things sampled. If the stage's posterior
-        mass is negligible (`matters` is false), only its evidence is kept."""
+        """The scenes of `count` known objects, with noise and unknown things sampled."""
         slots = max(self.settings.max_objects, 1)  # those beyond are empty
-        if not matters:
-            return Stage.without_scenes(float(state.log_evidence), slots)
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
         objects, gauss, log_weight, noise, log_evidence, lineage = jax.device_get(

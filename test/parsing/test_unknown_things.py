@@ -112,6 +112,15 @@ def test_a_fixed_number_counts_every_thing(library):
     assert sorted(o.type for o in posterior.objects) == ["brick", UNKNOWN]
 
 
+def test_with_room_for_one_the_larger_thing_is_told(parser):
+    """The brick gains more as a brick than the ball as something unknown, but then the ball's returns are outliers."""
+    ball = trimesh.creation.icosphere(3, 0.09), at(0.1, 0.03, 0.09)
+    one = parser.changed(replace(SETTINGS, max_objects=1)).parse(frame(BRICK, ball))
+    assert [o.type for o in one.objects] == [UNKNOWN] and one.num_objects[1] > 0.999
+    assert one.log_evidence < -1000  # against things for which there is no room
+    np.testing.assert_allclose(np.exp(one.samples.log_weight).sum(), 1, rtol=1e-4)
+
+
 def test_what_stands_outside_the_region_is_not_told(parser):
     """Nor is it counted: the rest is as if it were not there, and nothing is compiled."""
     traces = smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
