@@ -276,7 +276,8 @@ class SceneParserNode(Node):
         if "mode" in names:
             self._parts.health.begin()
         if self._begun and names & _COMPILED:
-            self._prepare()
+            if (wrong := self._prepare()) and self._ready is not None:
+                self._parts.refuse(f"{wrong}; the parser goes on with the settings that it had")
         elif self._begun and names & {*PER_FRAME}:
             self._in_use.adjust(self._parts.settings.in_use(ParserSettings))
         if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:

@@ -246,3 +246,12 @@ def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, librar
         assert ros.call(ChangeState, change, request).success
         assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == label
     ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
+
+    # A setting for which a parser has to be made, when there is no library any more.
+    shutil.move(folder, tmp_path / "away")
+    request = SetParameters.Request(parameters=[Parameter("count_ratio", value=0.2).to_parameter_msg()])
+    assert ros.call(SetParameters, f"{name}/set_parameters", request).results[0].successful
+    ros.wait_for_diagnosis(diagnostics, "the parser goes on with the settings that it had", mine)
+    shutil.move(tmp_path / "away", folder)
+    assert ros.call(Trigger, reload, Trigger.Request()).success
+    ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
