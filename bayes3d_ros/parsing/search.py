@@ -80,7 +80,8 @@ def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, no
     ):  # rows below the camera's last one have no returns; those above would lend them a consensus
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth
-    apart = in_front / (3 * noise.sigma[0] + 0.003 * depth)
+    # Where returns err by centimetres, three standard deviations would take a whole object for explained.
+    apart = in_front / (jnp.minimum(3 * noise.sigma[0], SEARCH.widest_noise) + 0.003 * depth)
     unexplained, explained = jnp.clip(apart - 1, 0.0, 1.0), jnp.clip(2 - jnp.abs(apart), 0.0, 1.0)
     inside = pixel_class == IN_WORKSPACE
     return UnexplainedReturns(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
