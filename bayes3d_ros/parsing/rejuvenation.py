@@ -56,7 +56,7 @@ class GivenFrame(NamedTuple):
 
 
 class Effort(NamedTuple):
-    turns: Int[Array, ""]  # number of objects to move
+    turns: Int[Array, ""]  # number of objects to move, at most
     heats: Int[Array, ""]  # steps down to the smallest exponent, 0.7^heats
 
 
@@ -68,8 +68,8 @@ def rejuvenate(
     frame: GivenFrame,
     effort: Effort,
 ) -> WeightedScenes:
-    """Move `effort.turns` objects: first the one with the fewest distinct placements, then the following slots.
-    proposals [M]: of the stage of each slot."""
+    """Move as many objects as `effort` says, each once: first the one with the fewest distinct placements, then those
+    of the following slots. proposals [M]: of the stage of each slot."""
     slots = state.objects.type.shape[1]
     left = jnp.stack([distinct_fraction(_slot(state.objects, m).x, state.log_weight) for m in range(slots)])
     first = jnp.argmin(jnp.where(jnp.arange(slots) < count, left, jnp.inf))
@@ -79,7 +79,7 @@ def rejuvenate(
         own = jax.tree.map(lambda a: a[m], proposals)
         return _move(jax.random.fold_in(key, number), state, m, own, count, frame, effort.heats)
 
-    return jax.lax.fori_loop(0, effort.turns, turn, state)
+    return jax.lax.fori_loop(0, jnp.minimum(effort.turns, count), turn, state)
 
 
 def _slot(objects: Placement, m: Array | int) -> Placement:

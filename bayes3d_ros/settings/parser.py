@@ -225,14 +225,14 @@ class ParserSettings:
         high=1.0,
     )
     rejuvenated_objects: int = setting(
-        1,
+        3,
         "number of objects that are moved again by MCMC after the last object is added. More take time for each, "
         "and help in crowded scenes",
         low=0,
         high=100,
     )
     tempering_steps: int = setting(
-        0,
+        4,
         "number of steps in which the posterior is flattened and sharpened again during the MCMC moves of "
         "rejuvenated_objects, so that objects move between distant poses. 0: off; each step takes as long as a "
         "move",

@@ -61,7 +61,6 @@ SHARED_SETTINGS = ParserSettings(
     unknown=False,
     outline_sigma=0.0,  # added after the weights, no part of the model
     particles=192,
-    rejuvenated_objects=3,  # all of them: ranks are of copies that count once
 )
 
 _SIDE, _NOISE_ROUNDS, _REACH_SDS = 9, 5, 3.5  # of the grids on which noise is sought
@@ -237,7 +236,7 @@ def run_shared_sampler(
             state, info = smc.step(jax.random.fold_in(key, number), state, count, *given)
             ess.append(float(info.ess))
         log_weights.append(float(state.log_evidence) + problem.log_count[number])
-        if number > 1 and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
+        if number >= (1 if settings.tempering_steps else 2) and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
             again = (context, model, settings.window, settings.ess_threshold, effort)
             state = smc.refresh(jax.random.fold_in(key, 2000 + number), state, jnp.int32(number), *again)
         stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weights[-1]))
