@@ -2,9 +2,10 @@
 
 """Is the evidence of a library the mean of the evidences of its types? A check of the search that needs no truth.
 
-The prior of one object is uniform over K types, so its evidence is Z = (1/K) sum_t Z_t, where Z_t is the evidence with
-a library of type t alone. A search for one type cannot lose that type among others. So where Z is smaller than the
-mean, the search over all types missed something.
+One object is something unknown with probability u, else of one of K types: its evidence is
+Z = u Z_unknown + (1 - u) / K sum_t Z_t. With a library of type t alone it is Z(t) = u Z_unknown + (1 - u) Z_t. So Z is
+the mean of all Z(t). A search for one type cannot lose that type among others: where Z is smaller than the mean, the
+search over all types missed something.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,7 +47,7 @@ def count(quick: bool) -> int:
 def steps(quick: bool) -> Iterator[Step]:
     """A row a frame."""
     library = ten_ycb_types()
-    settings = ParserSettings(fixed_objects=1, max_objects=1, unknown=False)
+    settings = ParserSettings(fixed_objects=1, max_objects=1)
     whole = SceneParser(library, settings)
     each = [SceneParser(Library((model,)), settings) for model in library.models]
     for recording in recordings(quick=True):
