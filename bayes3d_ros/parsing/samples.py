@@ -14,9 +14,12 @@ from bayes3d_ros.geometry.poses import slide
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table
 from bayes3d_ros.parsing.table_fit import SeenTable
-from bayes3d_ros.parsing.unknown_things import UnknownThing, drawn_box
+from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, drawn_box
 from bayes3d_ros.posterior.types import SceneSamples
 
+# Multiples of these, modulo one, fill a cube evenly: powers of 1 / g, where g^(d + 1) = g + 1
+# (in one dimension g is the golden ratio).
+_EVENLY = np.roots([1.0, *[0.0] * (UNCERTAIN - 1), -1.0, -1.0]).real.max() ** -np.arange(1.0, UNCERTAIN + 1)
 LEAST_LOG_WEIGHT = -30.0  # nats: samples of less weight are not kept
 
 
@@ -170,8 +173,7 @@ def _with_things(
     for s, held in enumerate(things):
         for k, thing in enumerate(held):
             slot = int(count[s]) + k
-            # Shares of how far a thing extends behind, spread evenly over the samples (multiples of the golden ratio).
-            size[s, slot], centre, yaw = drawn_box(thing, (0.6180339887 * s + 0.31 * k) % 1)
+            size[s, slot], centre, yaw = drawn_box(thing, np.mod(s * _EVENLY + 0.31 * k, 1.0))
             kind[s, slot] = unknown_type
             T[s, slot] = T_camera_table[s] @ slide(*(np.array(a) for a in (*centre, yaw)))
     return _Slots(kind, face, T, size)

@@ -9,7 +9,8 @@ connected region of such returns is a thing, or outliers, with
                + log(count_ratio P(unknown)),
 
 where the last term is the prior of one more thing. A thing is described by a box: upright, about its visible part, on
-the table. How far the box extends behind is uniform between the visible depth and the larger of the visible sides.
+the table. How far the box extends behind is uniform between the visible depth and the larger of the visible sides. Its
+other ends lie anywhere between the outermost returns and the next ones, which are not the thing's.
 
 Where the prior has a region, a thing whose middle lies outside is neither reported nor counted; its returns stay what
 they are to any scene: those of such a thing, or outliers.
@@ -38,6 +39,7 @@ from bayes3d_ros.parsing.support_plane import connected_pieces
 _EIGHT = np.ones((3, 3))  # pixels that touch at a corner belong together
 _BRIDGED = 2  # pixels without a return across which a thing continues
 _LEAST_SIDE = 0.005  # metres: the smallest side of a box
+UNCERTAIN = 8  # numbers in which boxes of one thing differ, see `drawn_box`
 
 
 class UnknownThing(NamedTuple):
@@ -51,6 +53,7 @@ class UnknownThing(NamedTuple):
     behind: Float[
         np.ndarray, "3"
     ]  # side along which it may go on (0 x, 1 y), towards which end (-1, 1), how far at most
+    pixel: float  # metres between neighbouring returns, across the view
 
 
 class ThingsOfScenes(NamedTuple):
@@ -139,7 +142,9 @@ def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownTh
         if area[k] < LEAST_THING or log_gain <= 0:
             continue
         own = regions == k
-        found.append(UnknownThing(np.flatnonzero(own), log_gain, *_box(points[own], camera[:2])))
+        size, centre, yaw, behind = _box(points[own], camera[:2])
+        pixel = float(np.median(seen.depth[own])) / seen.camera.fx
+        found.append(UnknownThing(np.flatnonzero(own), log_gain, size, centre, yaw, behind, pixel))
     return tuple(found)
 
 
@@ -195,14 +200,20 @@ def _box(points: Float[np.ndarray, "P 3"], camera: Float[np.ndarray, "2"]):
     return np.append(side, height), centre, float(angles[best]), behind
 
 
-def drawn_box(thing: UnknownThing, share: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "2"], float]:
-    """Size, centre and yaw of the box if the thing extends behind by this share, 0 to 1, of how far it may."""
+def drawn_box(
+    thing: UnknownThing, shares: Float[np.ndarray, "8"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "2"], float]:
+    """Size, centre and yaw of the box. shares, 0 to 1: of how far it may extend behind; of a pixel by which its top,
+    its two ends along x and those along y lie beyond the returns; and by which either end of its longer side turns."""
+    behind, top, turn_one, turn_other = (float(share) for share in (shares[0], shares[1], shares[6], shares[7]))
     axis, end, most = int(thing.behind[0]), thing.behind[1], thing.behind[2]
-    size = thing.size.copy()
-    size[axis] += share * most
+    beyond = thing.pixel * shares[2:6].reshape(2, 2)  # x and y: the low end, the high end
+    beyond[axis, 1 if end > 0 else 0] = behind * most
+    size = thing.size + np.append(beyond.sum(1), thing.pixel * top)
+    off = 0.5 * (beyond[:, 1] - beyond[:, 0])
     c, s = np.cos(thing.yaw), np.sin(thing.yaw)
-    along = np.array([[c, s], [-s, c]])[axis]
-    return size, thing.centre + 0.5 * end * share * most * along, thing.yaw
+    turn = float(np.arctan2(thing.pixel * (turn_one - turn_other), size[:2].max()))
+    return size, thing.centre + off @ np.array([[c, s], [-s, c]]), thing.yaw + turn
 
 
 def things_image(things: Sequence[UnknownThing], shape: tuple[int, int]) -> Int[np.ndarray, "h w"]:

@@ -14,6 +14,7 @@ from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.parser import SceneParser
+from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, drawn_box
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.simulate.ray_casting import RayCaster
 
@@ -75,6 +76,33 @@ def test_an_unknown_thing_has_an_upright_box_on_the_table(both):
     assert ball.size == pytest.approx([0.09, 0.09, 0.09], abs=0.03)
     assert ball.contact_face == -1 and ball.face_probabilities == ()
     assert (ball.size_sigma >= 0).all() and ball.size_sigma.max() < 0.03
+
+
+def test_its_box_is_no_more_certain_than_the_pixels(both):
+    """0.6 m away a pixel is 3 mm wide; each end of the box lies somewhere in one."""
+    (ball,) = (o for o in both.objects if o.is_unknown)
+    assert (ball.size_sigma > 0.0006).all()
+    sd = np.sqrt(np.diag(ball.covariance))
+    assert (sd[:3] > 0.0004).all() and (sd[:3] < 0.03).all() and sd[3:].max() > 0.006
+
+
+def test_boxes_of_one_thing_spread_over_the_pixels_about_it():
+    thing = UnknownThing(
+        np.arange(3), 1.0, np.array([0.1, 0.06, 0.05]), np.array([0.2, -0.1]), 0.3, np.array([1.0, -1.0, 0.04]), 0.004
+    )
+    size, centre, yaw = drawn_box(thing, np.zeros(UNCERTAIN))
+    np.testing.assert_allclose([*size, *centre, yaw], [0.1, 0.06, 0.05, 0.2, -0.1, 0.3])
+    rng = np.random.default_rng(0)
+    drawn = [drawn_box(thing, rng.uniform(size=UNCERTAIN)) for _ in range(4000)]
+    size, centre, yaw = (np.array(part) for part in zip(*drawn, strict=True))
+    c, s = np.cos(0.3), np.sin(0.3)
+    along = (centre - [0.2, -0.1]) @ np.array([[c, -s], [s, c]])
+    one = 0.004 / 12**0.5  # standard deviation of an end within its pixel
+    hidden = 0.04 / 12**0.5
+    np.testing.assert_allclose(size.std(0), [2**0.5 * one, np.hypot(one, hidden), one], rtol=0.05)
+    np.testing.assert_allclose(along.std(0), [one / 2**0.5, np.hypot(one, hidden) / 2], rtol=0.05)
+    assert along[:, 1].mean() == pytest.approx(-0.009, abs=0.001)  # it extends towards -y, by 2 cm on average
+    assert yaw.std() == pytest.approx(2**0.5 * one / 0.104, rel=0.05)
 
 
 def test_samples_hold_it_as_the_last_type(both, library):
