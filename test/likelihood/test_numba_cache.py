@@ -47,7 +47,7 @@ def copy(tmp_path):
 def told(copy, pair="Pair"):
     """What the function returns in a process of its own, and how often it was found on disk."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
-    environment |= {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment |= {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1", compiling.COMPILES: "1"}
     call = [sys.executable, "-c", CALL.format(pair)]
     done = subprocess.run(call, cwd=copy.parent, env=environment, capture_output=True, text=True)
     assert not done.returncode, done.stderr
@@ -71,6 +71,39 @@ def test_a_constant_of_another_file_and_a_class_that_is_gone(copy):
     edit(copy / "likelihood/cpu/compiled_for_test.py", "Pair", "Both")
     assert told(copy, "Both") == (0.15, 0)
     assert told(copy, "Both") == (0.15, 1)
+
+
+@pytest.fixture
+def another(tmp_path, monkeypatch):
+    """What another process would be asked to do, where its loops are kept in a folder of their own."""
+    asked = []
+
+    def run(command, env, **_):
+        asked.append((command, env))
+        return subprocess.CompletedProcess(command, 0 if len(asked) > 1 else 1)
+
+    monkeypatch.delenv(compiling.COMPILES, raising=False)
+    monkeypatch.setattr(compiling.config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(compiling.subprocess, "run", run)
+    return asked
+
+
+def test_loops_are_compiled_in_a_process_of_their_own_and_once(another, tmp_path):
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept/loops_of_before").touch()
+    compiling._compile_elsewhere()  # fails
+    compiling._compile_elsewhere()
+    compiling._compile_elsewhere()  # nothing to do
+    assert len(another) == 2
+    command, environment = another[0]
+    assert "bayes3d_ros.likelihood.cpu.gain" in command[-1] and compiling.COMPILES in environment
+    assert [path.name for path in (tmp_path / "kept").iterdir()] == [compiling._note().name]
+
+
+def test_a_process_that_compiles_asks_no_other(another, monkeypatch):
+    monkeypatch.setenv(compiling.COMPILES, "1")
+    compiling._compile_elsewhere()
+    assert another == []
 
 
 def test_a_folder_that_cannot_be_written_does_no_harm(copy, monkeypatch):

@@ -7,19 +7,29 @@ holds functions and constants of other files too, and cached types are looked up
 a stamp of all these sources is a part of every function's name, and with it of the names of its files in the cache.
 Files of other sources are not read, whatever is in them; processes of different sources do not disturb each other, and
 nothing of this needs a folder that can be written. Such files are removed where that is possible.
+
+Loops are compiled in a process of their own, and read from disk by all others. A process that has just compiled a
+function links later ones to it; one that reads them from disk has the copies that were compiled into their callers.
+These round differently: log evidence differed by up to 4 nats between the first run on a machine and all later ones.
 """
 
 import hashlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import llvmlite
+import llvmlite.binding
 import numba
-from numba import cfunc, njit, types
+from numba import cfunc, config, njit, types
 
 _PACKAGE = Path(__file__).parents[2]
+_MODULES = ("bayes3d_ros.likelihood.cpu.gain", "bayes3d_ros.parsing.coarse_search_cpu")  # importing them compiles all
+COMPILES = "BAYES3D_COMPILES_HERE"  # environment variable: this process compiles what is not on disk
 # Files of all functions that are compiled, and of constants that they use.
 SOURCES = (
     "likelihood/cpu/*.py",
@@ -60,6 +70,33 @@ with suppress(OSError):
     _remove_others(_sources(), STAMP)
 
 
+def _note() -> Path:
+    """The file that says that this machine's loops are on disk: where numba keeps them."""
+    beside = Path(__file__).parent / "__pycache__"
+    folder = Path(config.CACHE_DIR) if config.CACHE_DIR else beside  # type: ignore[attr-defined]
+    if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bayes3d_ros"
+    version = f"{sys.version_info.major}{sys.version_info.minor}"
+    return folder / f"loops_{STAMP}_{llvmlite.binding.get_host_cpu_name()}_{version}"
+
+
+def _compile_elsewhere() -> None:
+    """Have another process compile the loops, unless they are on disk. If that fails, this process compiles them."""
+    with suppress(OSError):
+        note = _note()
+        if COMPILES in os.environ or note.exists():
+            return
+        note.parent.mkdir(parents=True, exist_ok=True)
+        for old in note.parent.glob("loops_*"):
+            if STAMP not in old.name:
+                old.unlink(missing_ok=True)
+        found_at = os.pathsep.join([str(_PACKAGE.parent), os.environ.get("PYTHONPATH", "")])
+        environment = os.environ | {COMPILES: "1", "JAX_PLATFORMS": "cpu", "PYTHONPATH": found_at}
+        command = [sys.executable, "-c", f"import {', '.join(_MODULES)}"]
+        if subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0:
+            note.touch()
+
+
 def kept(compiled: Callable[..., Any]) -> Callable[..., Any]:
     """A decorator of numba's, whose functions are kept on disk under their name and the stamp."""
 
@@ -80,3 +117,5 @@ inlined = kept(
 )
 handler = kept(cfunc(types.int64(types.int64), cache=True))  # of XLA's calls, frame to error
 task = kept(cfunc(types.void(types.int64), cache=True))  # of XLA's thread pool, given a job
+
+_compile_elsewhere()

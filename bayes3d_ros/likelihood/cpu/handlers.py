@@ -17,7 +17,7 @@ from bayes3d_ros.likelihood.cpu.buffers import (
 from bayes3d_ros.likelihood.cpu.compiling import allocating, handler, inlined, strict, task
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.rays import render_object, render_plane
-from bayes3d_ros.likelihood.cpu.sharing import address_of, begin_job, finish, frame_of, leave, next_part, part_done
+from bayes3d_ros.likelihood.cpu.sharing import address_of, frame_of, leave, next_part, part_done, share
 from bayes3d_ros.likelihood.cpu.windows import (
     begin_ends,
     begin_patch,
@@ -218,18 +218,14 @@ _help_depth_address = address_of("bayes3d_help_depth", _help_depth)
 @handler
 def _gain(frame):
     if not answered_version(frame):
-        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_gain_address())
-        _gain_parts(frame, job)
-        finish(job)
+        share(frame, len(floats(frame, 9)) // 4, _help_gain_address())
     return 0
 
 
 @handler
 def _depth(frame):
     if not answered_version(frame):
-        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_depth_address())
-        _depth_parts(frame, job)
-        finish(job)
+        share(frame, len(floats(frame, 9)) // 4, _help_depth_address())
     return 0
 
 

@@ -26,7 +26,7 @@ from bayes3d_ros.likelihood.cpu.patches import (
     new_scene_pixels,
     sort_scene,
 )
-from bayes3d_ros.likelihood.cpu.sharing import address_of, begin_job, finish, frame_of, leave, next_part, part_done
+from bayes3d_ros.likelihood.cpu.sharing import address_of, frame_of, leave, next_part, part_done, share
 from bayes3d_ros.likelihood.cpu.windows import begin_patch, mark_changes, windows_with
 from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, floats, integers, register
 
@@ -198,9 +198,7 @@ _help_address = address_of("bayes3d_help_shared_gain", _help)
 def _shared_gain(frame):
     """See `gain.shared_gain`."""
     if not answered_version(frame):
-        job = begin_job(frame, len(floats(frame, 9)) // 4, _help_address())
-        _score_parts(frame, job)
-        finish(job)
+        share(frame, len(floats(frame, 9)) // 4, _help_address())
     return 0
 
 

@@ -2,11 +2,11 @@
 
 """One call of XLA, shared by the threads of XLA's pool.
 
-A handler describes its call as a *job*: so many hypotheses, in parts of a few. It asks the pool for helpers, and works
-on parts itself. Each worker takes the next part that nobody has taken. Then the handler waits for the parts that
-helpers have begun, and for nothing else: XLA promises neither that a helper runs at once nor that it runs at all. A
-helper that comes late finds no part. Hypotheses do not depend on each other, so results depend neither on the number of
-threads nor on who worked on what.
+A handler describes its call as a *job*: so many hypotheses, in parts of a few. It asks the pool to run a *task* that
+works on the job, and runs the task itself. Each worker takes the next part that nobody has taken. Then the handler waits
+for the parts that others have begun, and for nothing else: XLA promises neither that a task runs at once nor that it
+runs at all. One that comes late finds no part. Hypotheses do not depend on each other, so results depend neither on the
+number of threads nor on who worked on what.
 
 A job is some 64-bit words in memory of its own, which the last one who leaves frees. Fields that several threads write
 are changed by atomic operations.
@@ -59,6 +59,18 @@ def _call(context, function, arguments):
     return types.int64(types.int64, types.int64), generate
 
 
+@intrinsic
+def _run(context, task, job):
+    """Call the task at an address."""
+
+    def generate(context, builder, signature, values):
+        kind = ir.FunctionType(ir.VoidType(), [_WORD])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), [values[1]])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64), generate
+
+
 def address_of(name: str, task: Any) -> Any:
     """A compiled function that returns the address of a compiled `task`. Compiled code that is kept on disk must not
     hold the address, which is another one in each process: it holds the name, which must be unique."""
@@ -84,16 +96,22 @@ def _threads(frame):
     return max(found[0], 1) if error == 0 else 1
 
 
+@strict
+def leave(job):
+    if _add(job + 8 * _PRESENT, -1) == 1:
+        _free(job)
+
+
 @allocating
-def begin_job(frame, count, task):
-    """A job for `count` hypotheses of this call, with helpers asked for: its address. task: address of the function
-    that helps."""
+def share(frame, count, task):
+    """Have `count` hypotheses of this call worked on by this thread and those of the pool. task: address of the
+    function that takes parts of a job until none is left, and leaves it."""
     threads = _threads(frame) if count >= 2 * LEAST_PART else 1
     each = max(LEAST_PART, -(-count // (threads * PARTS_A_THREAD)))
     parts = -(-count // each)
     job = _malloc(8 * _JOB_WORDS)
     told = words(job, _JOB_WORDS)
-    told[_TAKEN], told[_DONE], told[_PRESENT], told[_PARTS] = 0, 0, 1, parts
+    told[_TAKEN], told[_DONE], told[_PRESENT], told[_PARTS] = 0, 0, 2, parts  # present: the task here, and who waits
     told[_EACH], told[_COUNT], told[_FRAME] = each, count, frame
     call = words(frame, CONTEXT_WORD + 1)
     schedule = words(call[API_WORD], SCHEDULE_WORD + 1)[SCHEDULE_WORD]
@@ -103,7 +121,10 @@ def begin_job(frame, count, task):
         if _call(schedule, arguments.ctypes.data) != 0:
             _add(job + 8 * _PRESENT, -1)
             break
-    return job
+    _run(task, job)
+    while _add(job + 8 * _DONE, 0) < parts:
+        _sched_yield()
+    leave(job)
 
 
 @strict
@@ -126,18 +147,3 @@ def part_done(job):
 def frame_of(job):
     """XLA's call frame, which lasts as long as there are parts to be done."""
     return words(job, _JOB_WORDS)[_FRAME]
-
-
-@strict
-def leave(job):
-    if _add(job + 8 * _PRESENT, -1) == 1:
-        _free(job)
-
-
-@strict
-def finish(job):
-    """Wait until all parts are done, and leave."""
-    parts = words(job, _JOB_WORDS)[_PARTS]
-    while _add(job + 8 * _DONE, 0) < parts:
-        _sched_yield()
-    leave(job)
