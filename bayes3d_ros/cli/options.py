@@ -59,7 +59,8 @@ def table_frame_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def replace_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """--replace."""
-    return click.option("--replace", is_flag=True, help="Replace a model of the same name; default: refuse.")(command)
+    told = "Replace a model of the same name that came from elsewhere; default: refuse."
+    return click.option("--replace", is_flag=True, help=told)(command)
 
 
 def _choose_device(device: str | None) -> None:

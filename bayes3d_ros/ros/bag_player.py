@@ -188,7 +188,7 @@ class _SeveralTopics(click.Command):
     metavar="SECONDS",
     help="how long to wait for a subscriber on every topic",
 )
-@click.option("--wait-for", default="", metavar="NODE", help="wait for this node's subscriptions instead")
+@click.option("--wait-for", default="", metavar="NODE", help="wait so long for this node's subscriptions instead")
 @click.option("--topics", multiple=True, metavar="TOPIC ...", help="play only these")
 @click.pass_obj
 def play(

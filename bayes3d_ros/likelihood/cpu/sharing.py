@@ -3,10 +3,10 @@
 """One call of XLA, shared by the threads of XLA's pool.
 
 A handler describes its call as a *job*: so many hypotheses, in parts of a few. It asks the pool to run a *task* that
-works on the job, and runs the task itself. Each worker takes the next part that nobody has taken. Then the handler waits
-for the parts that others have begun, and for nothing else: XLA promises neither that a task runs at once nor that it
-runs at all. One that comes late finds no part. Hypotheses do not depend on each other, so results depend neither on the
-number of threads nor on who worked on what.
+works on the job, and runs the task itself. Each worker takes the next part that nobody has taken. Then the handler
+waits for the parts that others have begun, and for nothing else: XLA promises neither that a task runs at once nor
+that it runs at all. One that comes late finds no part. Hypotheses do not depend on each other, so results depend
+neither on the number of threads nor on who worked on what.
 
 A job is some 64-bit words in memory of its own, which the last one who leaves frees. Fields that several threads write
 are changed by atomic operations.
