@@ -28,6 +28,7 @@ from bayes3d_ros.ros.parameters import SettingsParameters
 from bayes3d_ros.ros.worker import NewestWorker
 
 _REPORT_PERIOD = 1.0  # seconds between two messages on /diagnostics
+_SILENT_REPORTS = 5  # after so many without any image the log says why
 
 
 class DepthNodeParts:
@@ -54,7 +55,8 @@ class DepthNodeParts:
         node.add_on_set_parameters_callback(self._on_set_parameters)
         node.add_post_set_parameters_callback(self._after_set_parameters)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
-        node.create_timer(_REPORT_PERIOD, lambda: self._diagnostics.publish(report()), clock=steady)
+        self._silent_reports = 0  # since inputs were opened, without an image so far
+        node.create_timer(_REPORT_PERIOD, lambda: self._tell(report()), clock=steady)
 
     @property
     def received(self) -> int:
@@ -94,6 +96,14 @@ class DepthNodeParts:
     def stop(self, timeout: float) -> bool:
         """There is no thread to wait for."""
         return True
+
+    def _tell(self, report: DiagnosticArray) -> None:
+        """Publish a report. Whoever does not look at /diagnostics reads once in the log why no image comes."""
+        self._diagnostics.publish(report)
+        silent = self.inputs is not None and self.inputs.received == 0
+        self._silent_reports = self._silent_reports + 1 if silent else 0
+        if self._silent_reports == _SILENT_REPORTS:
+            self._node.get_logger().warning(f"no image so far: {report.status[0].message}")
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         reason = self._forbids(parameters)

@@ -208,6 +208,15 @@ def test_a_retired_parameter_keeps_the_node_unconfigured_until_the_new_one_is_se
     ros.wait_for_diagnosis(diagnostics, "no publisher", f"{name}: scene parsing")
 
 
+def test_the_log_says_once_why_no_image_comes(ros, library_folder: Path) -> None:
+    process = ros.start_parser(library_folder, namespace="/nobody")
+    told = "no image so far: no publisher on /nobody/depth/image_rect"
+    ros.wait_for(lambda: told in process.output(), "the line in the log")
+    reports = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.wait_for(lambda: len([r for r in reports if "/nobody/" in r.status[0].name]) > 2, "more reports")
+    assert process.output().count("no image so far") == 1
+
+
 def test_a_best_effort_publisher_is_heard(ros, library_folder: Path) -> None:
     best_effort = ros.camera("/other", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     ros.start_parser(library_folder, namespace="/other")
