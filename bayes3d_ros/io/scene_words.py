@@ -21,10 +21,10 @@ _COLUMNS = (  # where they begin, as a share of the width, and two lines of head
     (0.28, "p(exists)", ""),
     (0.37, "p(type)", ""),
     (0.45, "explained", "% of pixels"),
-    (0.57, "x, y of its origin", "mm on the table"),
-    (0.73, "σ position", "mm"),
-    (0.83, "σ yaw", "degrees"),
-    (0.92, "p(pose)", ""),
+    (0.555, "x, y of its origin", "mm on the table"),
+    (0.70, "σ position", "mm"),
+    (0.79, "σ yaw", "degrees"),
+    (0.87, "p(pose)", "± sd"),
 )
 _WRAP, _WRAP_BOLD = 112, 86  # characters in a line
 
@@ -86,8 +86,14 @@ def _numbers(found: ObjectEstimate, on_table: ObjectEstimate, known: bool) -> tu
         f"{x:.0f}, {y:.0f}" if known else "–",
         short(sigma),
         short(yaw) if known else "–",
-        f"{found.mode_weight:.2f}",
+        _weight_of_pose(found),
     )
+
+
+def _weight_of_pose(found: ObjectEstimate) -> str:
+    """The weight of the reported pose; where there are several, with its standard deviation from seed to seed."""
+    error = found.modes[0].weight_error if len(found.modes) > 1 else float("nan")
+    return f"{found.mode_weight:.2f}" + (f" ± {error:.2f}" if error >= 0.005 else "")
 
 
 def short(value: float) -> str:

@@ -59,9 +59,20 @@ def test_the_table_of_numbers_has_headings_with_units_and_a_row_an_object(
 ):
     frame = depth_frame()
     posterior = fake_posterior(frame, TYPES, 3)
+    bowl, *others = posterior.objects
+    modes = (bowl.modes[0]._replace(weight=0.66, weight_error=0.288), bowl.modes[0]._replace(weight=0.34))
+    bowl = replace(bowl, modes=modes)
+    posterior = replace(posterior, objects=(bowl, *others))
     plot_scene(frame.depth, posterior, tmp_path / "a.png")
     texts = [text for _, _, text in written]
-    for heading in ("p(exists)\n", "explained\n% of pixels", "σ position\nmm", "σ yaw\ndegrees", "p(pose)\n"):
+    assert "0.66 ± 0.29" in texts
+    for heading in (
+        "p(exists)\n",
+        "explained\n% of pixels",
+        "σ position\nmm",
+        "σ yaw\ndegrees",
+        "p(pose)\n± sd",
+    ):
         assert heading in texts
     found = posterior.objects[1]
     sigma = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
