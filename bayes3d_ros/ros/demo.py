@@ -202,7 +202,7 @@ def errors(posterior: ScenePosterior, library: Library, true_poses: dict[str, np
 
 def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> list[str]:
     """A line per object: type, probabilities, pose, standard deviations, distance from the truth, modes of the pose."""
-    head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'position, m':<23}{'orientation xyzw':<28}"
+    head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'camera frame: x y z, m':<23}{'orientation xyzw':<28}"
     lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'ADD-S, mm':>10}  p(mode)"]
     for estimate in posterior.objects:
         sigma = np.sqrt(np.diag(estimate.covariance))
