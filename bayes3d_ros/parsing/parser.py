@@ -27,7 +27,7 @@ from bayes3d_ros.parsing.explanation import explain
 from bayes3d_ros.parsing.observe import Observation, bare_table, observe
 from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
-from bayes3d_ros.parsing.rejuvenation import Effort
+from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
 from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
@@ -213,7 +213,7 @@ class SceneParser:
         """The stage with the most likely number of objects, after some of its objects were moved by MCMC. A
         single object is moved only with tempering: its own stage has moved it already."""
         settings = self.settings
-        if count < 2 and not (count and settings.tempering_steps):
+        if count < fewest_moved(settings.tempering_steps):
             return state
         key = jax.random.fold_in(key, 2000 + count)
         effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))

@@ -60,6 +60,12 @@ class Effort(NamedTuple):
     heats: Int[Array, ""]  # steps down to the smallest exponent, 0.7^heats
 
 
+def fewest_moved(tempering_steps: int) -> int:
+    """Objects of a scene from which on some are moved again: the stage of a single object has moved it already, though
+    not through a flattened posterior."""
+    return 1 if tempering_steps else 2
+
+
 def rejuvenate(
     key: PRNGKeyArray,
     state: WeightedScenes,

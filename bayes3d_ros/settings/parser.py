@@ -6,7 +6,14 @@ import math
 from dataclasses import dataclass
 
 from bayes3d_ros.settings.declaring import setting, validate
-from bayes3d_ros.settings.shared import check_depths, check_window, far_setting, near_setting, sigma_max_setting
+from bayes3d_ros.settings.shared import (
+    check_depths,
+    check_window,
+    far_setting,
+    near_setting,
+    seed_setting,
+    sigma_max_setting,
+)
 
 LEAST_REGION = 0.02  # metres along each axis: the search of a narrower one would find next to nothing in it
 # Settings of the parser that hold from one frame to the next without anything being compiled.
@@ -239,13 +246,7 @@ class ParserSettings:
         low=0,
         high=20,
     )
-    seed: int = setting(
-        0,
-        "seed of the random numbers. It is combined with the stamp of the image, so that the same image always "
-        "gives the same result",
-        low=0,
-        high=2**31 - 1,
-    )
+    seed: int = seed_setting()
 
     def __post_init__(self) -> None:
         validate(self)

@@ -41,6 +41,16 @@ def sigma_max_setting() -> Any:
     )
 
 
+def seed_setting() -> Any:
+    return setting(
+        0,
+        "seed of the random numbers. It is combined with the stamp of the image, so that the same image always "
+        "gives the same result",
+        low=0,
+        high=2**31 - 1,
+    )
+
+
 def check_window(window: int) -> None:
     if window % 2 == 0:
         raise ValueError(f"window must be odd, got {window}")

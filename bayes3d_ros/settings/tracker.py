@@ -5,7 +5,14 @@
 from dataclasses import dataclass
 
 from bayes3d_ros.settings.declaring import setting, validate
-from bayes3d_ros.settings.shared import check_depths, check_window, far_setting, near_setting, sigma_max_setting
+from bayes3d_ros.settings.shared import (
+    check_depths,
+    check_window,
+    far_setting,
+    near_setting,
+    seed_setting,
+    sigma_max_setting,
+)
 
 
 @dataclass(frozen=True)
@@ -131,13 +138,7 @@ class TrackerSettings:
         low=0.005,
         high=1.0,
     )
-    seed: int = setting(
-        0,
-        "seed of the random numbers. It is combined with the stamp of the image, so that the same image always "
-        "gives the same result",
-        low=0,
-        high=2**31 - 1,
-    )
+    seed: int = seed_setting()
 
     def __post_init__(self) -> None:
         validate(self)

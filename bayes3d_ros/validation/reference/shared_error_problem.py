@@ -40,7 +40,7 @@ from bayes3d_ros.objects.placement import Table as PriorTable
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.observe import amplitudes_of
-from bayes3d_ros.parsing.rejuvenation import Effort
+from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
@@ -236,7 +236,7 @@ def run_shared_sampler(
             state, info = smc.step(jax.random.fold_in(key, number), state, count, *given)
             ess.append(float(info.ess))
         log_weights.append(float(state.log_evidence) + problem.log_count[number])
-        if number >= (1 if settings.tempering_steps else 2) and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
+        if number >= fewest_moved(settings.tempering_steps) and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
             again = (context, model, settings.window, settings.ess_threshold, effort)
             state = smc.refresh(jax.random.fold_in(key, 2000 + number), state, jnp.int32(number), *again)
         stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weights[-1]))
