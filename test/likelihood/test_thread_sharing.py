@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 SCORES = """
-import json, sys
+import json
 from concurrent.futures import ThreadPoolExecutor
 import jax, jax.numpy as jnp, numpy as np, trimesh
 from bayes3d_ros.likelihood.scene_score import pad_scene, render_objects
@@ -53,7 +53,7 @@ def of_threads(count: int) -> dict:
 
 
 def test_results_are_those_of_one_thread() -> None:
-    of_threads(1)  # the process that compiles the loops may round differently from those that read them from disk
+    of_threads(1)  # so that two processes do not compile the loops at the same time
     with ThreadPoolExecutor(2) as both:
         one, five = both.map(of_threads, (1, 5))
     assert one["same"] and five["same"]

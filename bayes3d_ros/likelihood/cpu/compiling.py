@@ -27,6 +27,8 @@ import llvmlite.binding
 import numba
 from numba import cfunc, config, njit, types
 
+from bayes3d_ros.jax_runtime import user_cache
+
 _PACKAGE = Path(__file__).parents[2]
 _MODULES = ("bayes3d_ros.likelihood.cpu.gain", "bayes3d_ros.parsing.coarse_search_cpu")  # importing them compiles all
 COMPILES = "BAYES3D_COMPILES_HERE"  # environment variable: this process compiles what is not on disk
@@ -75,7 +77,7 @@ def _note() -> Path:
     beside = Path(__file__).parent / "__pycache__"
     folder = Path(config.CACHE_DIR) if config.CACHE_DIR else beside  # type: ignore[attr-defined]
     if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bayes3d_ros"
+        folder = user_cache()
     version = f"{sys.version_info.major}{sys.version_info.minor}"
     return folder / f"loops_{STAMP}_{llvmlite.binding.get_host_cpu_name()}_{version}"
 

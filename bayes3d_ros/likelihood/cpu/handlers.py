@@ -152,11 +152,12 @@ def picture_of(frame, own_rows):
 
 
 @allocating
-def _gain_parts(frame, job):
+def _gain_parts(job):
     """Take parts of the call, one after the other, until none is left. See `gain.compiled_gain`."""
     part = next_part(job)
     if part[0] == part[1]:
         return
+    frame = frame_of(job)
     things, planes, sigma = things_of(frame), floats(frame, 9), floats(frame, 17)
     numbers, settings = floats(frame, 14), integers(frame, 19)
     window = settings[0]
@@ -178,11 +179,12 @@ def _gain_parts(frame, job):
 
 
 @allocating
-def _depth_parts(frame, job):
+def _depth_parts(job):
     """The same for `gain.compiled_depth`."""
     part = next_part(job)
     if part[0] == part[1]:
         return
+    frame = frame_of(job)
     things, planes = things_of(frame), floats(frame, 9)
     numbers, shape, start = floats(frame, 12), integers(frame, 14), floats(frame, 13)
     picture = Picture(  # of which only the camera counts: nothing was observed
@@ -200,32 +202,32 @@ def _depth_parts(frame, job):
 
 
 @task
-def _help_gain(job):
-    _gain_parts(frame_of(job), job)
+def _work_gain(job):
+    _gain_parts(job)
     leave(job)
 
 
 @task
-def _help_depth(job):
-    _depth_parts(frame_of(job), job)
+def _work_depth(job):
+    _depth_parts(job)
     leave(job)
 
 
-_help_gain_address = address_of("bayes3d_help_gain", _help_gain)
-_help_depth_address = address_of("bayes3d_help_depth", _help_depth)
+_work_gain_address = address_of("bayes3d_work_gain", _work_gain)
+_work_depth_address = address_of("bayes3d_work_depth", _work_depth)
 
 
 @handler
 def _gain(frame):
     if not answered_version(frame):
-        share(frame, len(floats(frame, 9)) // 4, _help_gain_address())
+        share(frame, len(floats(frame, 9)) // 4, _work_gain_address())
     return 0
 
 
 @handler
 def _depth(frame):
     if not answered_version(frame):
-        share(frame, len(floats(frame, 9)) // 4, _help_depth_address())
+        share(frame, len(floats(frame, 9)) // 4, _work_depth_address())
     return 0
 
 

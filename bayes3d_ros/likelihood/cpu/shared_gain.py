@@ -134,11 +134,12 @@ def _forget(former_sums):
 
 
 @allocating
-def _score_parts(frame, job):
+def _score_parts(job):
     """Take parts of the call, one after the other, until none is left. See `gain.shared_gain`."""
     begin, end = next_part(job)
     if begin == end:
         return
+    frame = frame_of(job)
     things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 26)
     block, scene_rows, scene_columns, own_rows = whole[0], whole[1], whole[2], whole[3]
     picture = picture_of(frame, own_rows)
@@ -186,19 +187,19 @@ def _score_parts(frame, job):
 
 
 @task
-def _help(job):
-    _score_parts(frame_of(job), job)
+def _work(job):
+    _score_parts(job)
     leave(job)
 
 
-_help_address = address_of("bayes3d_help_shared_gain", _help)
+_work_address = address_of("bayes3d_work_shared_gain", _work)
 
 
 @handler
 def _shared_gain(frame):
     """See `gain.shared_gain`."""
     if not answered_version(frame):
-        share(frame, len(floats(frame, 9)) // 4, _help_address())
+        share(frame, len(floats(frame, 9)) // 4, _work_address())
     return 0
 
 
