@@ -22,6 +22,7 @@ class ObjectFacts(NamedTuple):
     sigma: Float[np.ndarray, "3"]
     probability: float  # that it exists
     type_probability: float
+    pose_probability: float  # the weight of the reported pose among all poses that the image allows
     explained: float
 
 
@@ -56,6 +57,7 @@ class SceneHistory:
                 np.sqrt(np.diag(found.covariance)[:3]),
                 found.probability,
                 found.type_probabilities.get(found.type, float("nan")),
+                found.mode_weight,
                 found.explained,
             )
             for name, found in zip(ids, on_table.objects, strict=True)

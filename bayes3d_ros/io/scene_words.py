@@ -24,7 +24,7 @@ _COLUMNS = (  # where they begin, as a share of the width, and two lines of head
     (0.555, "x, y of its origin", "mm on the table"),
     (0.70, "σ position", "mm"),
     (0.79, "σ yaw", "degrees"),
-    (0.87, "p(pose)", "± sd"),
+    (0.87, "p(pose)", ""),
 )
 _WRAP, _WRAP_BOLD = 112, 86  # characters in a line
 

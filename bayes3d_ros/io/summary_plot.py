@@ -146,8 +146,10 @@ def _probability_panel(axis: Axes, seconds: Float[np.ndarray, "N"], tracks: Sequ
         axis.plot(seconds, track.values(lambda thing: thing.type_probability), **style)
         exists = track.values(lambda thing: thing.probability)
         axis.plot(seconds, exists, **(style | {"linestyle": ":", "marker": ""}))
+        pose = track.values(lambda thing: thing.pose_probability)
+        axis.plot(seconds, pose, **(style | {"linestyle": "", "marker": "x", "markersize": 5}))
     axis.set_ylim(-0.03, 1.05)
-    _dress(axis, "p(type), dotted: p(exists)")
+    _dress(axis, "p(type); dotted: p(exists); crosses: p(pose), of the reported pose among its alternatives")
 
 
 def _count_panel(axis: Axes, seconds: Float[np.ndarray, "N"], history: SceneHistory) -> None:

@@ -71,7 +71,7 @@ def test_the_table_of_numbers_has_headings_with_units_and_a_row_an_object(
         "explained\n% of pixels",
         "σ position\nmm",
         "σ yaw\ndegrees",
-        "p(pose)\n± sd",
+        "p(pose)\n",
     ):
         assert heading in texts
     found = posterior.objects[1]

@@ -52,6 +52,7 @@ def test_a_frame_is_remembered_as_it_is_told_on_the_table(depth_frame, fake_post
     for thing, found in zip(frame.objects, told.objects, strict=True):
         np.testing.assert_allclose(thing.position, found.position)
         np.testing.assert_allclose(thing.sigma, np.sqrt(np.diag(found.covariance)[:3]))
+        assert thing.pose_probability == found.mode_weight
         assert thing.sigma.min() > 0 and (thing.sigma[:2] > 0.003).all()
 
 
