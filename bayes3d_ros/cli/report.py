@@ -20,20 +20,22 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
     """Write a page in Markdown for each finished experiment.
 
     Give JSON files of `bayes3d evaluate`, or the folders that hold them. A page, EXPERIMENT.md, says what the
-    experiment measures, the command, commit, date and machine, and the summary with what is wanted. In folders, files
-    of other programs are passed over, and unfinished experiments are named on stderr; a file that you name must be
-    a finished experiment.
+    experiment measures, the command, commit, date and machine, the summary with what is wanted, and shows its
+    pictures. JSON and pictures are copied to OUT/results: pages can be made again from that folder, with others
+    added. In folders, files of other programs are passed over, and unfinished experiments are named on stderr; a file
+    that you name must be a finished experiment.
 
     If any of them answers a claim of the Bayes3D paper, paper.md holds all of its claims against the reports that are
     given; claims of other experiments are "not run".
     """
     from bayes3d_ros.validation.experiments import load, wanted
     from bayes3d_ros.validation.paper_page import PAPER_PAGE, answers_the_paper, paper_page
-    from bayes3d_ros.validation.report import Report, ReportError, page, read_report
+    from bayes3d_ros.validation.report import RESULTS, Report, ReportError, page, read_report, shown_pictures
 
     found: dict[str, Path] = {}
     contents: dict[str, Report] = {}
     pages: list[tuple[Path, str]] = []
+    copies: dict[Path, Path] = {}
     for file, named in _files(reports):
         try:
             content = read_report(file)
@@ -47,12 +49,19 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
             raise InputError(f"{file}: expected one report of {name}, {found[name]} is another")
         found[name], contents[name] = file, content
         module = load(name)
-        pages.append((out / f"{name}.md", page(content, module.__doc__ or "", wanted(module))))
+        pictures = shown_pictures(content, file.parent)
+        pages.append((out / f"{name}.md", page(content, module.__doc__ or "", wanted(module), pictures)))
+        copies[file] = out / RESULTS / f"{name}.json"
+        copies |= {file.parent / picture: out / RESULTS / picture for picture in pictures}
     if not pages:
         raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
     if answers_the_paper(contents):
         pages.append((out / PAPER_PAGE, paper_page(contents)))
-    out.mkdir(parents=True, exist_ok=True)
+    (out / RESULTS).mkdir(parents=True, exist_ok=True)
+    for source, target in copies.items():
+        if source.resolve() != target.resolve():
+            with whole_file(target) as handle:
+                handle.write(source.read_bytes())
     for path, text in pages:
         with whole_file(path) as handle:
             handle.write(text.encode())

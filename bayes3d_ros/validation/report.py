@@ -14,6 +14,8 @@ from bayes3d_ros.validation.experiments import EXPERIMENTS, Wanted
 _WIDTH = 120
 _MOST_COLUMNS = 6  # groups of a summary side by side in one table
 
+RESULTS = "results"  # folder beside the pages: their JSON and pictures
+
 Report = Mapping[str, Any]  # the JSON of an experiment
 Place = tuple[str, ...]  # of a number in a summary: names of its groups, then its own
 
@@ -43,8 +45,9 @@ def is_report(content: Any) -> bool:
     return "rows" in content and isinstance(content.get("summary", 0), dict | None)
 
 
-def page(report: Report, about: str, wanted: Wanted) -> str:
-    """The page of an experiment. about: what it measures, the docstring of its module; wanted: see `experiments`."""
+def page(report: Report, about: str, wanted: Wanted, pictures: Sequence[str] = ()) -> str:
+    """The page of an experiment. about: what it measures, the docstring of its module; wanted: see `experiments`;
+    pictures: names of PNG files in RESULTS."""
     name = report["experiment"]
     command = f"bayes3d evaluate {name}{' --quick' if report.get('quick') else ''} --out DIR"
     parts = [f"# {name}", "<!-- Made by `bayes3d report`: do not edit. -->", *paragraphs(about), f"    {command}"]
@@ -52,10 +55,16 @@ def page(report: Report, about: str, wanted: Wanted) -> str:
     if notes := report.get("notes"):
         parts.append("\n".join(f"- {note}" for note in notes))
     parts += ["## Summary", *_summary_tables(report["summary"], wanted)]
-    if pictures := report.get("pictures"):
-        parts.append(f"Pictures beside the JSON: {', '.join(f'`{picture}`' for picture in pictures)}.")
+    parts += [f"![{picture}]({RESULTS}/{picture})" for picture in pictures]
+    parts.append(f"All rows: [{RESULTS}/{name}.json]({RESULTS}/{name}.json).")
     parts.append("[outputs.md](../outputs.md) explains every number.")
     return "\n\n".join(parts) + "\n"
+
+
+def shown_pictures(report: Report, folder: Path) -> list[str]:
+    """Names of the pictures in the folder of the report's JSON that its page shows."""
+    names = report.get("pictures") or []
+    return [name for name in names if name.endswith(".png") and Path(name).name == name and (folder / name).is_file()]
 
 
 def paragraphs(about: str) -> list[str]:

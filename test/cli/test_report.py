@@ -62,7 +62,24 @@ def test_a_page_says_what_when_where_and_how_well(tmp_path: Path) -> None:
     assert rows["machine"] == ["A CPU, 2 cores, JAX on cpu, Linux"] and rows["versions"] == ["python 3.12.1, jax 0.12"]
     assert rows["reached"] == ["0.9833", "at least 0.98"]
     assert rows["scenes"] == ["2", ""] and rows["log_loss"] == ["-", ""] and rows["not_met"] == ["none", ""]
-    assert "- 60 scenes | on which" in page and "`planted.png`" in page
+    assert "- 60 scenes | on which" in page and "planted.png" not in page  # there is no such file
+
+
+def test_a_page_shows_the_pictures_and_can_be_made_again_from_its_results(tmp_path: Path) -> None:
+    pictures = {"pictures": ["planted.png", "planted.pdf", "frames/1.png"]}
+    file = written(tmp_path, PLANTED | pictures)
+    (tmp_path / "planted.png").write_bytes(b"a picture")
+    out = tmp_path / "pages"
+    assert run(file, "--out", out).exit_code == 0
+    page = (out / "planted.md").read_text()
+    assert "![planted.png](results/planted.png)" in page and ".pdf" not in page and "frames/1.png" not in page
+    assert "(results/planted.json)" in page
+    assert (out / "results" / "planted.png").read_bytes() == b"a picture"
+    file.unlink()
+    (out / "planted.md").unlink()
+    again = run(out / "results", "--out", out)
+    assert again.exit_code == 0, again.output
+    assert (out / "planted.md").read_text() == page
 
 
 def test_groups_of_the_same_numbers_stand_side_by_side(tmp_path: Path) -> None:
