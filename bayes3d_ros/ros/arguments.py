@@ -23,6 +23,8 @@ def check_arguments(name: str, description: str, args: Sequence[str] | None = No
         own = remove_ros_args(words)[1:]
     except RuntimeError as error:  # rclpy's errors of arguments
         problem = " ".join(str(error).split(", at /")[0].split())
+        if "Sequence should be of same type" in problem:
+            problem += " (in a list, write every number with a decimal point: [0.0, 0.5])"
         _refuse(name, f"unknown ROS arguments {problem}" if problem.startswith("[") else problem)
     if {"-h", "--help"} & set(own):
         sys.stdout.write(usage(name, description))

@@ -49,6 +49,7 @@ def test_help_says_what_the_node_does_and_where_its_parameters_are(args, capsys)
         (["-p", "library:=objects"], "got -p"),
         (["--ros-args", "--nonsense"], "unknown ROS arguments ['--nonsense']"),
         (["--ros-args", "-p", "library"], "Couldn't parse parameter override rule: '-p library'"),
+        (["--ros-args", "-p", "sigmas:=[0, 0.5]"], "write every number with a decimal point: [0.0, 0.5]"),
         (["--ros-args", "--params-file", "/no/file"], "--params-file /no/file"),
     ],
 )
