@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.objects.model import Library, LibraryError, check_types
+from bayes3d_ros.objects.model import LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.collision_scene import check_frame
 from bayes3d_ros.posterior.object_ids import IdMemory, named
@@ -20,7 +20,7 @@ from bayes3d_ros.posterior.reframe import in_frame
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
-from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
+from bayes3d_ros.ros.depth_node import InferenceParts, answer, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView, one_line
 from bayes3d_ros.ros.node_settings import (
     FIXED_WHILE_ACTIVE,
@@ -34,8 +34,9 @@ from bayes3d_ros.ros.object_transforms import ObjectTransforms
 from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parse_requests import ParseAnswer
 from bayes3d_ros.ros.parse_service import ParseService
-from bayes3d_ros.ros.parser_bundle import LEAST_CAPACITY, MakeParser, ParserBundle, make_bundle, types_of
+from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, types_of
 from bayes3d_ros.ros.parser_in_use import ParserInUse
+from bayes3d_ros.ros.parser_preparation import CANNOT_COMPILE, ParserPreparation
 from bayes3d_ros.ros.planning_scene import PlanningScenePublisher
 from bayes3d_ros.ros.publishers import ScenePublishers
 from bayes3d_ros.ros.scene_outputs import ToldScene
@@ -44,8 +45,6 @@ from bayes3d_ros.ros.summary import found_words, key_values
 from bayes3d_ros.settings import PER_FRAME, ParserSettings
 
 _COMPILED = {f.name for f in fields(ParserSettings)} - {*PER_FRAME}  # a parser is made for these
-_CANNOT_COMPILE = "cannot compile the parser"
-
 _PURPOSE = "Depth images in, posteriors over 3D tabletop scenes out: which objects stand where, and how sure that is."
 
 
@@ -56,7 +55,6 @@ class SceneParserNode(Node):
 
     def __init__(self, make_parser: MakeParser = SceneParser) -> None:
         super().__init__("scene_parser")
-        self._make_parser = make_parser
         self._parts = InferenceParts(
             self,
             SCENE_PARSER_SETTINGS,
@@ -67,20 +65,16 @@ class SceneParserNode(Node):
             forbids=self._why_not_set,
         )
         self._in_use = ParserInUse()
-        self._libraries: tuple[Library, ...] = ()  # of the parser in use, and of the one that is prepared
-        self._capacity = LEAST_CAPACITY
+        self._preparation = ParserPreparation(self, self._parts, self._in_use, make_parser, self._on_prepared)
         self._frames: OutputFrames | None = None  # there while inputs are; likewise
         self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
         self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
         self._ids = IdMemory()  # the worker's alone
-        self._preparing_since: float | None = None
-        self._requests = 0
         self._outputs = ScenePublishers(self)
         self._parse = ParseService(self, self._parse_timeout, self._why_not, self._why_late)
-        self._prepared = self.create_guard_condition(self._on_prepared)
         self.create_service(Trigger, "~/reload_library", self._on_reload)
         if self.get_parameter("autostart").value:
-            self._prepare()
+            self._preparation.begin()
 
     # Lifecycle
 
@@ -88,14 +82,12 @@ class SceneParserNode(Node):
         """Load the library and compile, unless that has been done already."""
         try:
             if self._ready is None:
-                library, settings = self._load()
-                self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
-                self._libraries = (library,)
+                self._preparation.make()
         except (ValueError, LibraryError) as error:
             self._parts.refuse(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            self._parts.refuse(self._parts.failure(_CANNOT_COMPILE, error))
+            self._parts.refuse(self._parts.failure(CANNOT_COMPILE, error))
             return TransitionCallbackReturn.FAILURE
         self._parts.refusal = ""
         return super().on_configure(state)
@@ -118,10 +110,7 @@ class SceneParserNode(Node):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the parser."""
-        self._in_use.forget()
-        self._libraries, self._capacity = (), LEAST_CAPACITY
-        self._requests += 1  # a parser on its way is not wanted any more
-        self._preparing_since = None
+        self._preparation.forget()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -146,62 +135,8 @@ class SceneParserNode(Node):
     def _ready(self) -> ParserBundle | None:
         return self._in_use.bundle
 
-    def _load(self) -> tuple[Library, ParserSettings]:
-        """The library and settings that the parameters name, which a parser may be made of. Raises ValueError,
-        LibraryError."""
-        folder = self._parts.settings.read(SceneParserNodeSettings).library
-        settings = self._parts.settings.read(ParserSettings)
-        library = library_in(folder)
-        try:
-            check_types(settings.types, library)
-        except ValueError as error:
-            raise ValueError(f"parameter {error} ({folder})") from None
-        self._in_use.adjust(settings)
-        self._capacity = max(self._capacity, settings.max_objects)
-        return library, settings
-
-    def _size(self) -> tuple[int, int]:
-        settings = self._parts.settings.read(SceneParserNodeSettings)
-        return settings.warm_up_width, settings.warm_up_height
-
-    def _prepare(self) -> str:
-        """Have the worker build a parser from the parameters as they are now; what is wrong, or empty."""
-        try:
-            (library, settings), size = self._load(), self._size()
-        except (ValueError, LibraryError) as error:
-            if self._ready is None:
-                self._parts.refuse(str(error))
-            return str(error)
-        self._requests += 1
-        request, capacity = self._requests, self._capacity
-        self._libraries = (*(() if self._ready is None else (self._ready.parser.library,)), library)
-        self._preparing_since = time.monotonic()
-        self._parts.refusal = ""
-        self.get_logger().info(f"preparing a parser for {len(library.models)} object types")
-
-        def job() -> None:
-            if request != self._requests:
-                return  # a later request is on its way
-            try:
-                bundle, refusal = make_bundle(self._make_parser, library, settings, size, capacity), ""
-            except Exception as error:
-                bundle, refusal = None, self._parts.failure(_CANNOT_COMPILE, error)
-            if request == self._requests:  # else nobody wants it any more
-                if bundle is not None:
-                    self._in_use.put(bundle)
-                self._parts.refusal = refusal
-                self._prepared.trigger()
-
-        self._parts.worker.call(job)
-        return ""
-
-    def _on_prepared(self) -> None:
-        """Runs on the executor when the worker has built a parser, or failed to."""
-        if self._preparing_since is None:
-            return  # a cleanup came first
-        seconds = time.monotonic() - self._preparing_since
-        self._preparing_since = None
-        self._libraries = () if self._ready is None else (self._ready.parser.library,)
+    def _on_prepared(self, seconds: float) -> None:
+        """The worker has made a parser, or failed to."""
         state = self._state_label()
         if self._parts.refusal:
             self.get_logger().error(self._parts.refusal)
@@ -218,7 +153,7 @@ class SceneParserNode(Node):
 
     def _on_reload(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Load the library again; frames wait while it is compiled for, and a wrong one leaves the old in service."""
-        return answer(response, self._prepare(), "library loaded; frames wait until it is compiled for")
+        return answer(response, self._preparation.begin(), "library loaded; frames wait until it is compiled for")
 
     # Inputs and parameters
 
@@ -251,34 +186,21 @@ class SceneParserNode(Node):
             self._planning.close()
             self._planning = None
 
-    @property
-    def _begun(self) -> bool:
-        """Whether a parser is there or on its way."""
-        return self._ready is not None or self._preparing_since is not None
-
     def _why_not_set(self, parameters: list[Parameter]) -> str:
         """Why values may not be set now; empty where they may, as far as their types do not forbid it."""
         values = {p.name: p.value for p in parameters}
         fixed = [name for name in values if name in FIXED_WHILE_ACTIVE]
         if fixed and self._parts.inputs is not None:
             return f"{fixed[0]}: deactivate the node first"
-        most, types = values.get("max_objects"), values.get("types")
-        if self._begun and isinstance(most, int) and most > self._capacity:
-            return f"max_objects must be at most {self._capacity} until the node is cleaned up, got {most}"
-        try:
-            for library in self._libraries:
-                check_types(types if isinstance(types, (list, tuple)) else (), library)
-        except ValueError as error:
-            return str(error)
-        return ""
+        return self._preparation.why_not(values)
 
     def _parameters_changed(self, names: set[str]) -> None:
         if "mode" in names:
             self._parts.health.begin()
-        if self._begun and names & _COMPILED:
-            if (wrong := self._prepare()) and self._ready is not None:
+        if self._preparation.begun and names & _COMPILED:
+            if (wrong := self._preparation.begin()) and self._ready is not None:
                 self._parts.refuse(f"{wrong}; the parser goes on with the settings that it had")
-        elif self._begun and names & {*PER_FRAME}:
+        elif self._preparation.begun and names & {*PER_FRAME}:
             self._in_use.adjust(self._parts.settings.in_use(ParserSettings))
         if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:
             self._close_inputs()
@@ -385,8 +307,8 @@ class SceneParserNode(Node):
         """The level and the one line that says whether there is output, and if not, why."""
         if self._parts.refusal:
             return ERROR, self._parts.refusal
-        if self._preparing_since is not None:
-            return WARN, f"compiling for the library, {time.monotonic() - self._preparing_since:.0f} s so far"
+        if (seconds := self._preparation.seconds) is not None:
+            return WARN, f"compiling for the library, {seconds:.0f} s so far"
         if view is None:
             return WARN, f"the node is {self._state_label()}; configure and activate it"
         return self._parts.judge_on_request(view) if self._on_request else self._parts.judge(view, good="parsing")
