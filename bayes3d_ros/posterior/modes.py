@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 REACH_ANGLE = np.radians(8.0)  # the kernel's standard deviation in rotation ...
 REACH_DISTANCE = 0.01  # ... and in metres
 VALLEY = 4.0  # two peaks are two modes if the lower is this many times as dense as the pass between them
-NEIGHBOURS = 8.0  # effective samples that the kernel must hold, but no more than ...
+NEIGHBOURS = 8.0  # effective samples that the kernel must hold, or ...
 SHARE = 1 / 6  # ... this share of the weight: six single poses may be six modes
 SPARSE = 0.2  # share of the weight for which the kernel may hold fewer
 NEGLIGIBLE_SHARE = 0.02  # weight of a mode that is not worth listing
@@ -89,14 +89,19 @@ def _chords2(
 
 
 def kernel_width(nodes: Nodes) -> float:
-    """The smallest width of 1, 1.25, 1.25^2, ... kernels at which, for most of the weight, enough weight lies
-    within one width."""
+    """The smallest width of 1, 1.25, 1.25^2, ... kernels at which, for most of the weight, enough lies within one
+    width: NEIGHBOURS effective samples, or SHARE of the weight. Samples are counted where they lie: a light peak may
+    hold enough of them, though a few samples elsewhere outweigh it."""
     weight = nodes.weight / nodes.weight.sum()
-    enough = min(NEIGHBOURS * np.square(weight).sum(), SHARE) - 1e-9
     width = 1.0
-    while weight[np.einsum("ij,j->i", nodes.distance2 <= width**2, weight) < enough].sum() > SPARSE:
+    while True:
+        near = nodes.distance2 <= width**2
+        held = np.einsum("ij,j->i", near, weight)
+        samples = np.square(held) / np.einsum("ij,j->i", near, np.square(weight))
+        few = (samples < NEIGHBOURS - 1e-6) & (held < SHARE - 1e-9)
+        if weight[few].sum() <= SPARSE:
+            return width
         width *= 1.25
-    return width
 
 
 def peaks(nodes: Nodes) -> Int[np.ndarray, "K"]:

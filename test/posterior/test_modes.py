@@ -127,6 +127,17 @@ def test_all_narrow_peaks_are_found(peaks: int, apart: float) -> None:
     assert [mode.weight for mode in statistics(yaw).modes] == pytest.approx([1 / peaks] * peaks)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_light_peaks_stay_apart_though_a_few_samples_elsewhere_outweigh_theirs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    peak = np.arange(80) % 4
+    yaw = np.radians(90 * peak) + rng.normal(0, np.radians(0.1), 80)
+    weights = rng.gamma(4.0, size=80)
+    weights[:8:4] *= 12  # two samples of the first peak weigh more than the others of all peaks
+    weights *= (np.array([0.52, 0.24, 0.12, 0.12]) / np.bincount(peak, weights))[peak]
+    assert [mode.weight for mode in statistics(yaw, weights).modes] == pytest.approx([0.52, 0.24, 0.12, 0.12])
+
+
 def test_two_places_are_two_modes() -> None:
     rng = np.random.default_rng(0)
     position = rng.normal(0, 0.003, (100, 3)) + np.where(np.arange(100) < 60, 0.0, 0.08)[:, None] * [1.0, 0, 0]
