@@ -66,7 +66,7 @@ class SceneParserNode(Node):
         )
         self._in_use = ParserInUse()
         self._preparation = ParserPreparation(self, self._parts, self._in_use, make_parser, self._on_prepared)
-        self._frames: OutputFrames | None = None  # there while inputs are; likewise
+        self._frames: OutputFrames | None = None  # there while inputs are
         self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
         self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
         self._ids = IdMemory()  # the worker's alone
