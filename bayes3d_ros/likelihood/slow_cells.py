@@ -18,8 +18,6 @@ from bayes3d_ros.likelihood.shared_errors import (
     MODE_STEPS,
     MORE_MODE_STEPS,
     SAME_MODE_SDS,
-    SEEN_THROUGH,
-    SEEN_THROUGH_NATS,
     SharedErrorImage,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import PixelKinds
@@ -42,11 +40,13 @@ class CellModes(NamedTuple):
         apart = (self.place - mean) ** 2 * self.curvature / spread
         return np.logaddexp(np.logaddexp.reduce(self.height - 0.5 * np.log(spread) - 0.5 * apart), self.outliers)
 
-    def bad(self, own_plane: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
-        """log of the mean of two integrals: over b uniform in the `BAD_DEPTH` towards the camera, and over
-        planes of the cells' own."""
-        root = np.sqrt(np.maximum(self.curvature, 1e-12))
-        within = log_ndtr(-self.place * root) + log_ndtr((self.place + BAD_DEPTH) * root)  # its ends are far apart
+    def bad(
+        self, own_plane: Float[np.ndarray, "C"], mean: Float[np.ndarray, "*c"] | float = 0.0
+    ) -> Float[np.ndarray, "C"]:
+        """log of the mean of two integrals: over b uniform in the `BAD_DEPTH` before `mean`, and over planes of the
+        cells' own."""
+        root, place = np.sqrt(np.maximum(self.curvature, 1e-12)), self.place - mean
+        within = log_ndtr(-place * root) + log_ndtr((place + BAD_DEPTH) * root)  # its ends are far apart
         width = 0.5 * np.log(2 * np.pi) - np.log(root) - np.log(BAD_DEPTH)
         offset = np.logaddexp.reduce(self.height + width + within)
         return np.logaddexp(np.logaddexp(offset, own_plane) - np.log(2), self.outliers)
@@ -62,7 +62,8 @@ class SurfaceCells(NamedTuple):
     real: Bool[np.ndarray, "C K"]
     label: Int[np.ndarray, "C"]
     middle: Float[np.ndarray, "C 2"]  # column and row
-    own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own
+    own_plane: Float[np.ndarray, "C S"]  # log density with a plane of its own, wherever that is
+    median: Float[np.ndarray, "C"]  # residual, metres
 
 
 def modes_at_nodes(cells: SurfaceCells, errors: SharedErrorImage) -> list[CellModes]:
@@ -136,7 +137,6 @@ def cells_of(
     residual = spread(observed - depth[v, u], np.nan)
     lost = kinds.near_outline[v, u] & (observed < depth[v, u] + LOST_DEPTH)
     median = np.nanmedian(residual, 1) if len(residual) else np.zeros(0)
-    behind = SEEN_THROUGH_NATS * np.maximum(median - SEEN_THROUGH, 0)
     own_plane = np.stack([spread(values).sum(1) for values in errors.own_plane[:, v, u].astype(np.float64)], 1)
     return SurfaceCells(
         np.nan_to_num(residual),
@@ -146,7 +146,8 @@ def cells_of(
         real,
         label[v, u][first],
         middle,
-        own_plane - behind[:, None],
+        own_plane,
+        median,
     )
 
 

@@ -6,11 +6,18 @@ error integrated out and each cell given the waves in the cells beside it. The r
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.own_plane import blocks_beside
-from bayes3d_ros.likelihood.shared_errors import BAD_SPREAD, BAD_WEIGHT, REWEIGHTED_STEPS, SharedErrorImage
+from bayes3d_ros.likelihood.shared_errors import (
+    BAD_SPREAD,
+    BAD_WEIGHT,
+    REWEIGHTED_STEPS,
+    SEEN_THROUGH,
+    SEEN_THROUGH_NATS,
+    SharedErrorImage,
+)
 from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells
 
 
@@ -80,45 +87,105 @@ def given_others(
     return given
 
 
-def log_object(
-    cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, metres_a_pixel: float
-) -> float:
-    """log density of the cells of one object. The shared error is integrated out by Laplace's method about a mode
-    found in three reweighted steps. found: the cells' modes at the node."""
-    amplitudes = errors.amplitudes
-    share, model = float(amplitudes.bad_share), (scale * float(amplitudes.model)) ** 2
-    waves = (scale * float(amplitudes.wave)) ** 2
-    bad = found.bad(cells.own_plane[:, node])
-    middle = cells.middle - np.average(cells.middle, axis=0, weights=cells.real.sum(1))
-    phi = np.column_stack([np.ones(len(middle)), middle * metres_a_pixel])
-    column, row = (cells.middle // int(errors.block)).astype(int).T
-    beside = neighbours(column, row, phi, float(amplitudes.length))
+class SeenMiddle(NamedTuple):
+    """The middle of what is seen of an object."""
 
-    def log_cells(given: CellsGivenOthers, share: float):
-        mean = given.known + given.phi @ a
+    column: float
+    row: float
+    metres: float  # that a pixel covers there
+
+    def phi(self, column: Real[np.ndarray, "P"], row: Real[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
+        """1, x and y of pixels, metres from the middle."""
+        return np.column_stack(
+            [np.ones(len(column)), (column - self.column) * self.metres, (row - self.row) * self.metres]
+        )
+
+
+class ObjectErrors(NamedTuple):
+    """The C cells of one object at one node, and the node's errors."""
+
+    found: CellModes
+    own_plane: Float[np.ndarray, "C"]  # log density with planes of their own, wherever these are
+    median: Float[np.ndarray, "C"]  # residual, metres
+    phi: Float[np.ndarray, "C 3"]  # 1, x and y of each cell, metres from the middle of what is seen
+    beside: Neighbours
+    share: float  # of bad cells
+    model: float  # variances of a cell's own error and of the waves
+    waves: float
+    prior: Float[np.ndarray, "3"]  # variances of the shared error; zeros where there is none
+
+    def bad(self, a: Float[np.ndarray, "3"]) -> Float[np.ndarray, "C"]:
+        """Log likelihoods of bad cells, given the shared error a. Cameras do not see through the surface."""
+        shared = self.phi @ a
+        behind = np.maximum(self.median - shared - SEEN_THROUGH, 0)
+        return self.found.bad(self.own_plane - SEEN_THROUGH_NATS * behind, shared)
+
+    def log_cells(self, a: Float[np.ndarray, "3"], given: CellsGivenOthers) -> float:
+        """log density of the cells given the shared error a, the share of bad cells summed over."""
+        normal, bad = self.found.normal(given.known + given.phi @ a, np.sqrt(given.variance)), self.bad(a)
+        shares = [min(self.share * b, 0.9) for b in BAD_SPREAD]
         with np.errstate(divide="ignore"):
-            good = np.log1p(-share) + found.normal(mean, np.sqrt(given.variance))
-            return np.logaddexp(good, np.log(share) + bad).sum()
+            each = [np.logaddexp(np.log1p(-s) + normal, np.log(s) + bad).sum() for s in shares]
+        return float(logsumexp(np.array(each) + np.log(BAD_WEIGHT)))
 
-    a = np.zeros(3)
+    def given(self, a: Float[np.ndarray, "3"], bad: Float[np.ndarray, "C"], more: float = 0.0) -> CellsGivenOthers:
+        """The cells given the shared error a; more: variance that is added to each cell's own."""
+        return given_others(self.found, self.phi, a, self.model + more, self.waves, self.beside, self.share, bad)
+
+
+def object_errors(
+    cells: SurfaceCells, found: CellModes, node: int, scale: float, errors: SharedErrorImage, middle: SeenMiddle
+) -> ObjectErrors:
+    """found: the cells' modes at the node."""
+    amplitudes = errors.amplitudes
+    phi = middle.phi(*cells.middle.T)
+    column, row = (cells.middle // int(errors.block)).astype(int).T
     bias2, slope2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.lean)) ** 2
-    prior = np.maximum([bias2, slope2, slope2], 1e-12)
-    for step in range(REWEIGHTED_STEPS if bias2 + slope2 > 0 else 0):
-        given = given_others(found, phi, a, model + prior[0] if step == 0 else model, waves, beside, share, bad)
-        information, pull = _information(found, given)
-        a = np.linalg.solve(information + np.diag(1 / prior), pull)
-    given = given_others(found, phi, a, model, waves, beside, share, bad)
-    shares = [min(share * b, 0.9) for b in BAD_SPREAD]
-    log_all = logsumexp([log_cells(given, s) + np.log(w) for s, w in zip(shares, BAD_WEIGHT, strict=True)])
-    if bias2 + slope2 == 0:
+    return ObjectErrors(
+        found,
+        cells.own_plane[:, node],
+        cells.median,
+        phi,
+        neighbours(column, row, phi, float(amplitudes.length)),
+        float(amplitudes.bad_share),
+        (scale * float(amplitudes.model)) ** 2,
+        (scale * float(amplitudes.wave)) ** 2,
+        np.maximum([bias2, slope2, slope2], 1e-12) if bias2 + slope2 > 0 else np.zeros(3),
+    )
+
+
+def seen_middle(cells: SurfaceCells, metres: float) -> SeenMiddle:
+    """Of the cells of one object; metres: that a pixel covers."""
+    column, row = np.average(cells.middle, axis=0, weights=cells.real.sum(1))
+    return SeenMiddle(float(column), float(row), metres)
+
+
+def shared_error(of: ObjectErrors) -> Float[np.ndarray, "3"]:
+    """The mode of the error that the object's cells share, by reweighted steps: metres, and metres a metre along
+    columns and rows."""
+    a = np.zeros(3)
+    bad = of.bad(a)
+    for step in range(REWEIGHTED_STEPS if of.prior.any() else 0):
+        information, pull = _information(of.found, of.given(a, bad, of.prior[0] if step == 0 else 0.0))
+        a = np.linalg.solve(information + np.diag(1 / of.prior), pull)
+    return a
+
+
+def log_object(of: ObjectErrors) -> float:
+    """log density of the cells of one object. The shared error is integrated out by Laplace's method about its mode,
+    where bad cells are."""
+    a = shared_error(of)
+    given = of.given(a, of.bad(a))
+    log_all = of.log_cells(a, given)
+    if not of.prior.any():
         return log_all
-    information, pull = _information(found, given)
-    full = information + np.diag(1 / prior)
+    information, pull = _information(of.found, given)
+    full = information + np.diag(1 / of.prior)
     slope = pull - full @ a
     return (
         log_all
-        - 0.5 * (a**2 / prior).sum()
-        - 0.5 * np.log(prior).sum()
+        - 0.5 * (a**2 / of.prior).sum()
+        - 0.5 * np.log(of.prior).sum()
         - 0.5 * np.linalg.slogdet(full)[1]
         + 0.5 * slope @ np.linalg.solve(full, slope)
     )

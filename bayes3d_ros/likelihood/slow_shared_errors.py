@@ -3,6 +3,8 @@
 """The density of `shared_errors.py` for whole scenes, in float64 and as it is defined there: the reference of the
 kernel (`cpu/shared_gain.py`). It also scores the empty table, once a frame."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -10,11 +12,19 @@ from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SharedErrorImage
 from bayes3d_ros.likelihood.slow_cells import SurfaceCells, cells_of, lost_density, modes_at_nodes
-from bayes3d_ros.likelihood.slow_object_cells import log_object
+from bayes3d_ros.likelihood.slow_object_cells import (
+    ObjectErrors,
+    SeenMiddle,
+    log_object,
+    object_errors,
+    seen_middle,
+    shared_error,
+)
 from bayes3d_ros.likelihood.slow_pixel_kinds import (
     NOTHING,
     OBJECT,
     TABLE,
+    PixelKinds,
     around,
     kinds_of_pixels,
     mask_nats,
@@ -96,21 +106,61 @@ def log_density(
     mask = mask_nats(kinds.unknown, kinds.of_object, image) if errors.amplitudes.unknown else 0.0
     found = np.zeros((len(nodes.sigma), len(nodes.table), len(nodes.scale)))
     table = modes_at_nodes(_take(cells, cells.label == TABLE), errors)
-    objects = {}
-    for k in np.unique(cells.label[cells.label >= OBJECT]):
-        own = _take(cells, cells.label == k)
-        metres = depth[kinds.cell & (label == k)].mean() / float(image.focal[0])
-        objects[k] = own, modes_at_nodes(own, errors), metres
+    objects = objects_of(cells, depth, label, kinds, image, errors)
+    seen = with_shared_errors(depth, label, objects)
     for s in range(len(nodes.sigma)):
         fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
         fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
-        fixed += log_edges(depth, label, kinds.edge, image, errors, s).sum()
+        fixed += log_edges(seen, label, kinds.edge, image, errors, s).sum()
         for t, sd in enumerate(nodes.table.astype(float)):
             found[s, t] += fixed + table[s].normal(0.0, sd).sum()
-        for own, at_nodes, metres in objects.values():
-            for a, scale in enumerate(nodes.scale.astype(float)):
-                found[s, :, a] += log_object(own, at_nodes[s], s, scale, errors, metres)
+        for thing in objects.values():
+            for a in range(len(nodes.scale)):
+                found[s, :, a] += log_object(thing.at[s][a])
     return found.reshape(len(nodes.sigma), -1)
+
+
+class SeenObject(NamedTuple):
+    """The cells of one object at every node."""
+
+    middle: SeenMiddle
+    at: list[list[ObjectErrors]]  # pairs of noise, and for each of them the scales
+
+
+def objects_of(
+    cells: SurfaceCells,
+    depth: Float[np.ndarray, "H W"],
+    label: Int[np.ndarray, "H W"],
+    kinds: PixelKinds,
+    image: ScoredImage,
+    errors: SharedErrorImage,
+) -> dict[int, SeenObject]:
+    """The objects that have cells, by their labels."""
+    found = {}
+    for k in np.unique(cells.label[cells.label >= OBJECT]):
+        own = _take(cells, cells.label == k)
+        middle = seen_middle(own, depth[kinds.cell & (label == k)].mean() / float(image.focal[0]))
+        found[int(k)] = SeenObject(
+            middle,
+            [
+                [object_errors(own, modes, s, scale, errors, middle) for scale in errors.nodes.scale.astype(float)]
+                for s, modes in enumerate(modes_at_nodes(own, errors))
+            ],
+        )
+    return found
+
+
+def with_shared_errors(
+    depth: Float[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], objects: dict[int, SeenObject]
+) -> Float[np.ndarray, "H W"]:
+    """The scene's depth with the error that each object's cells share, at its mode at the middle node: where returns
+    of edges are looked for."""
+    seen = depth.copy()
+    for k, thing in objects.items():
+        v, u = np.nonzero(label == k)
+        middle_pair = thing.at[len(thing.at) // 2]
+        seen[v, u] += thing.middle.phi(u, v) @ shared_error(middle_pair[len(middle_pair) // 2])
+    return seen
 
 
 def _take(cells: SurfaceCells, which: Bool[np.ndarray, "C"]) -> SurfaceCells:

@@ -68,7 +68,8 @@ def _gather(
             count += 1
     median = _median(batch.residual, used, count, returns_sorted)
     batch.start[used] = median
-    behind = f32(SEEN_THROUGH_NATS) * max(median - f32(SEEN_THROUGH), f32(0.0))
+    # Those of the new object are told how far behind they are once its shared error is known.
+    behind = f32(SEEN_THROUGH_NATS) * max(median - f32(SEEN_THROUGH), f32(0.0)) if label == OLD else f32(0.0)
     for s in range(len(batch.own_plane) // w):
         batch.own_plane[s * w + used] = planes[s] - behind if label != TABLE else NO_MODE
     batch.label[used], batch.place_of_sum[used], batch.block[used] = label, place_of_sum, number
@@ -125,7 +126,8 @@ def _weigh(batch, used, returns, own, new_cells, nodes, fixed, old):
                 own.height[which * len(own.outliers) + at] = batch.height[which * w + c]
                 own.place[which * len(own.outliers) + at] = batch.place[which * w + c]
                 own.curvature[which * len(own.outliers) + at] = batch.curvature[which * w + c]
-            own.outliers[at], own.bad[at] = batch.outliers[c], batch.own_plane[s * w + c]
+            own.outliers[at], own.own_plane[at] = batch.outliers[c], batch.own_plane[s * w + c]
+            own.median[kept] = batch.start[c]
             own.block[kept], own.number[kept] = batch.block[c], batch.number[c]
             own.column[kept], own.row[kept] = batch.column[c], batch.row[c]
             kept += 1
@@ -134,10 +136,9 @@ def _weigh(batch, used, returns, own, new_cells, nodes, fixed, old):
 
 @inlined
 def _score_pixels(
-    picture, returns, space, scene, rectangle, stride, left, top, nodes, edges, used, values, place_of_sum, sums
+    picture, returns, space, scene, rectangle, stride, left, top, nodes, values, place_of_sum, sums
 ):  # fmt: skip
-    """Add the log densities of returns that belong to no cell to sums, those at edges once there are many side by side.
-    Returns how many edges wait."""
+    """Add the log densities of returns that belong to no cell and no edge to sums."""
     sigma, p_outlier, table, _, amplitudes = nodes
     u0, u1, v0, v1 = rectangle
     tables = len(table)
@@ -145,12 +146,6 @@ def _score_pixels(
         for u in range(u0, u1):
             k = (v - top) * stride + u - left
             kind = scene.kind[k]
-            if kind == EDGE:
-                put_edge(edges, used, picture, returns, u, v, space.depth[k], k, place_of_sum)
-                used += 1
-                if used == EDGES_SIDE_BY_SIDE:
-                    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
-                    used = 0
             if kind != UNKNOWN and kind != HIDDEN:
                 continue
             for s in range(len(sigma)):
@@ -163,29 +158,45 @@ def _score_pixels(
                     values[s] = log(p_outlier[s] + lost)
                 for t in range(tables):
                     sums[place_of_sum, s * tables + t] += values[s]
-    return used
+
+
+@strict
+def score_edges(picture, returns, space, scene, blocks, block, stride, left, top, nodes, edges, sums, one_row):
+    """Add the log densities of returns at edges to rows of sums, as `score_blocks` adds those of all others."""
+    height, width = len(picture.ray_y), len(picture.ray_x)
+    across, used = (width + block - 1) // block, 0
+    for number in blocks:
+        v0, u0 = number // across * block, number % across * block
+        for v in range(v0, min(v0 + block, height)):
+            for u in range(u0, min(u0 + block, width)):
+                k = (v - top) * stride + u - left
+                if scene.kind[k] != EDGE:
+                    continue
+                put_edge(edges, used, picture, returns, u, v, space.depth[k], k, 0 if one_row else number)
+                used += 1
+                if used == EDGES_SIDE_BY_SIDE:
+                    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
+                    used = 0
+    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
 
 
 @strict
 def score_blocks(
-    picture, returns, space, scene, blocks, block, stride, left, top, nodes, work, cell_work, batch, own, fixed, old,
+    picture, returns, space, scene, blocks, block, stride, left, top, nodes, values, cell_work, batch, own, fixed, old,
     one_row,
 ):  # fmt: skip
-    """Add the log likelihoods of blocks to rows of sums: each block to its own row, or, with `one_row`, all to the
-    first. Returns how many cells of the new object were kept."""
+    """Add the log likelihoods of blocks, without those of edges, to rows of sums: each block to its own row, or, with
+    `one_row`, all to the first. Returns how many cells of the new object were kept."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     across, returns_a_cell = (width + block - 1) // block, block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
-    edges, values = work
-    used, new_cells, edges_used = 0, 0, 0
+    used, new_cells = 0, 0
     _clear(batch, returns_a_cell)
     for number in blocks:
         v, u = number // across * block, number % across * block
         here = (u, min(u + block, width), v, min(v + block, height))
         place = 0 if one_row else number
-        edges_used = _score_pixels(
-            picture, returns, space, scene, here, stride, left, top, nodes, edges, edges_used, values, place, fixed
-        )  # fmt: skip
+        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, values, place, fixed)
         here_labels = _labels_of_cells(scene, here, stride, left, top)
         for label in range(TABLE, NEW + 1):
             if here_labels >> label & 1 == 0:
@@ -199,7 +210,6 @@ def score_blocks(
                 new_cells = _weigh(batch, used, returns_a_cell, own, new_cells, nodes, fixed, old)
                 used = 0
                 _clear(batch, returns_a_cell)
-    add_edges(edges, edges_used, picture, scene.depth, scene.label, stride, nodes, fixed)
     if used > 0:
         new_cells = _weigh(batch, used, returns_a_cell, own, new_cells, nodes, fixed, old)
     return new_cells

@@ -13,6 +13,7 @@ from bayes3d_ros.likelihood.cpu.cells import LOG_HALF, NO_MODE, bad_mode
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, inlined, strict
 from bayes3d_ros.likelihood.cpu.packing import larger
 from bayes3d_ros.likelihood.cpu.windows import exp, log
+from bayes3d_ros.likelihood.shared_errors import SEEN_THROUGH, SEEN_THROUGH_NATS
 
 
 class ObjectCells(NamedTuple):
@@ -22,7 +23,9 @@ class ObjectCells(NamedTuple):
     height: Float[np.ndarray, "2*M*S"]
     curvature: Float[np.ndarray, "2*M*S"]
     outliers: Float[np.ndarray, "M*S"]
+    own_plane: Float[np.ndarray, "M*S"]  # log density with a plane of its own, wherever that is
     bad: Float[np.ndarray, "M*S"]  # log likelihood as a bad cell, without the case of outliers
+    median: Float[np.ndarray, "M"]  # residual, metres
     block: Int[np.ndarray, "M"]  # number of the block, by rows
     column: Float[np.ndarray, "M"]  # mean place of the pixels
     row: Float[np.ndarray, "M"]
@@ -43,6 +46,8 @@ def new_object_cells(pairs, most):
         np.zeros(2 * pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
         np.zeros(pairs * most, np.float32),
+        np.zeros(pairs * most, np.float32),
+        np.zeros(most, np.float32),
         np.zeros(most, np.int64),
         np.zeros(most, np.float32),
         np.zeros(most, np.float32),
@@ -97,15 +102,19 @@ def _alike(x, y, length):
 
 
 @fast
-def begin_object(cells, count, share):
-    """Log likelihoods of bad cells, without the case of outliers. `cells.bad` holds those of planes of the cells' own
-    on entry."""
+def find_bad(cells, count, share, a):
+    """Log likelihoods of bad cells, without the case of outliers, given the error a that the object shares."""
     pairs, second = len(cells.outliers) // len(cells.column), u64(len(cells.outliers))
-    height, place, curvature, bad = cells.height, cells.place, cells.curvature, cells.bad
-    for k in range(u64(count * pairs)):
-        one = bad_mode(height[k], place[k], curvature[k])
-        other = bad_mode(height[second + k], place[second + k], curvature[second + k])
-        free = bad[k] + LOG_HALF
-        high = larger(larger(one, other), free)
-        worse = high + log(exp(one - high) + exp(other - high) + exp(free - high))
-        bad[k] = worse if share > f32(0.0) else NO_MODE
+    height, place, curvature, own_plane, bad = cells.height, cells.place, cells.curvature, cells.own_plane, cells.bad
+    a0, a1, a2 = f32(a[0]), f32(a[1]), f32(a[2])
+    for c in range(u64(count)):
+        shared = a0 + a1 * cells.x[c] + a2 * cells.y[c]
+        behind = f32(SEEN_THROUGH_NATS) * larger(cells.median[c] - shared - f32(SEEN_THROUGH), f32(0.0))
+        for s in range(u64(pairs)):
+            k = c * u64(pairs) + s
+            one = bad_mode(height[k], place[k] - shared, curvature[k])
+            other = bad_mode(height[second + k], place[second + k] - shared, curvature[second + k])
+            free = own_plane[k] - behind + LOG_HALF
+            high = larger(larger(one, other), free)
+            worse = high + log(exp(one - high) + exp(other - high) + exp(free - high))
+            bad[k] = worse if share > f32(0.0) else NO_MODE

@@ -206,6 +206,19 @@ def sort_scene(picture, space, patch, scene, changed, stride, size, border):
 
 
 @fast
+def shift_new(scene, size, stride, left, top, warp):
+    """Add the error that its returns share to the new object's depth. warp: metres at the image's first pixel, and
+    what a column and a row add; (left, top): the pixel at place 0."""
+    depth, label, rows = scene.depth, scene.label, size // stride
+    for v in range(u64(rows)):
+        first = v * u64(stride)
+        here = warp[0] + warp[2] * f32(i32(v) + top)
+        for u in range(u64(stride)):
+            own = label[first + u] == u8(NEW)
+            depth[first + u] += here + warp[1] * f32(i32(u) + left) if own else f32(0.0)
+
+
+@fast
 def mask_nats(space, scene, first, last, stride):
     """Log prior of the outlines of unknown things, in nats: negative. No pixel of the border is in the image's
     workspace."""

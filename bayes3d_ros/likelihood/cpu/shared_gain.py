@@ -5,14 +5,14 @@ calls them on CPUs."""
 
 import numpy as np
 
-from bayes3d_ros.likelihood.cpu.block_sums import score_blocks
+from bayes3d_ros.likelihood.cpu.block_sums import score_blocks, score_edges
 from bayes3d_ros.likelihood.cpu.buffers import f32, new_space, u8
 from bayes3d_ros.likelihood.cpu.cells import new_batch
 from bayes3d_ros.likelihood.cpu.compiling import allocating, handler, strict, task
 from bayes3d_ros.likelihood.cpu.edges import new_edges
 from bayes3d_ros.likelihood.cpu.handlers import objects_each, picture_of, render_all, things_of
 from bayes3d_ros.likelihood.cpu.nodes import nodes_of
-from bayes3d_ros.likelihood.cpu.object_cells import begin_object, find_neighbours, new_object_cells, place_cells
+from bayes3d_ros.likelihood.cpu.object_cells import find_bad, find_neighbours, new_object_cells, place_cells
 from bayes3d_ros.likelihood.cpu.object_density import find_shared_error, log_objects, new_node_rows
 from bayes3d_ros.likelihood.cpu.outlines import find_outlines, most_corners
 from bayes3d_ros.likelihood.cpu.patches import (
@@ -24,6 +24,7 @@ from bayes3d_ros.likelihood.cpu.patches import (
     mask_nats,
     new_patch,
     new_scene_pixels,
+    shift_new,
     sort_scene,
 )
 from bayes3d_ros.likelihood.cpu.sharing import address_of, frame_of, leave, next_part, part_done, share
@@ -59,7 +60,7 @@ def _gain_of(
     batch, own, work, former_sums, gain, warp,
 ):  # fmt: skip
     sigma, p_outlier, table, scale, amplitudes = nodes
-    fixed, old, touched, pixel_work, cell_work, rows, of_cells, error = work
+    fixed, old, touched, edges, pixel_work, cell_work, rows, of_cells, error = work
     known, former_fixed, former_old = former_sums
     border, tables, scales = 1, len(table), len(scale)
     height, width = len(picture.ray_y), len(picture.ray_x)
@@ -103,6 +104,10 @@ def _gain_of(
             picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
             pixel_work, cell_work, batch, own, former_fixed, former_old, False,
         )  # fmt: skip
+        score_edges(
+            picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes, edges,
+            former_fixed, False,
+        )  # fmt: skip
     for k in range(count):
         for level in range(fixed.shape[1]):
             fixed[0, level] -= former_fixed[touched[k], level]
@@ -114,12 +119,18 @@ def _gain_of(
     if new_cells > 0:
         column, row = place_cells(own, new_cells, metres)
         find_neighbours(own, new_cells, across, f32(amplitudes.length))
-        begin_object(own, new_cells, f32(amplitudes.bad_share))
+        error[:] = 0.0
+        find_bad(own, new_cells, f32(amplitudes.bad_share), error)
         # One paraboloid for all nodes: about the mode at the middle one.
         find_shared_error(own, rows, pairs // 2, new_cells, scale[scales // 2], amplitudes, error)
+        find_bad(own, new_cells, f32(amplitudes.bad_share), error)
         log_objects(own, rows, new_cells, scale, amplitudes, error, of_cells)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
         warp[0] = error[0] - warp[1] * column - warp[2] * row
+        shift_new(now, size, stride, left, top, warp)
+    score_edges(
+        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, fixed, True
+    )  # fmt: skip
     for s in range(pairs):
         for a in range(scales):
             value = old[0, s * scales + a] + of_cells[s * scales + a]
@@ -163,7 +174,7 @@ def _score_parts(job):
     own = new_object_cells(pairs, blocks)
     work = (
         np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
-        (new_edges(), np.zeros(pairs, np.float32)),
+        new_edges(), np.zeros(pairs, np.float32),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
         new_node_rows(blocks), np.zeros(pairs * scales), np.zeros(3),
     )  # fmt: skip

@@ -4,7 +4,7 @@
 to the density they are."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from bayes3d_ros.likelihood.own_plane import ANEW, BEND_SD, DEPTH_SD, SLOPE_SD, STEP_SD
 from bayes3d_ros.likelihood.shared_errors import (
@@ -17,7 +17,13 @@ from bayes3d_ros.likelihood.shared_errors import (
     SEEN_THROUGH_NATS,
 )
 from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells, modes
-from bayes3d_ros.likelihood.slow_object_cells import neighbours
+from bayes3d_ros.likelihood.slow_object_cells import (
+    Neighbours,
+    ObjectErrors,
+    SeenMiddle,
+    neighbours,
+    shared_error,
+)
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT
 from bayes3d_ros.validation.reference.shared_error_frame import (
     ErrorFrame,
@@ -48,11 +54,12 @@ class DrawnCells:
         number, which = np.unique(v // block * across + u // block, return_inverse=True)
         self.pixels = [(v[which == c], u[which == c]) for c in range(len(number))]
         middle = np.array([(columns.mean(), rows.mean()) for rows, columns in self.pixels])
-        self.metres = scene.depth[own].mean() / float(frame.rays.focal[0])
-        from_middle = (middle - np.average(middle, axis=0, weights=np.bincount(which))) * self.metres
-        self.phi = np.column_stack([np.ones(len(middle)), from_middle])
+        column, row = np.average(middle, axis=0, weights=np.bincount(which))
+        self.middle = SeenMiddle(float(column), float(row), scene.depth[own].mean() / float(frame.rays.focal[0]))
+        self.metres, self.phi = self.middle.metres, self.middle.phi(*middle.T)
         scale, amplitudes = frame.errors.scale, frame.amplitudes
-        self.shared = scale * rng.standard_normal(3) * [float(amplitudes.bias), *2 * (float(amplitudes.lean),)]
+        self.sds = scale * np.array([float(amplitudes.bias), *2 * (float(amplitudes.lean),)])
+        self.shared = rng.standard_normal(3) * self.sds
         share = rng.choice(BAD_SPREAD, p=BAD_WEIGHT) * float(amplitudes.bad_share)
         self.bad_share = min(share, 0.9)
         self.model, self.waves = (scale * float(amplitudes.model)) ** 2, (scale * float(amplitudes.wave)) ** 2
@@ -60,6 +67,7 @@ class DrawnCells:
         self.beside = neighbours(number % across, number // across, self.phi, length)
         self.told, self.told_place = np.zeros((2, len(middle)))
         self.planes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.told_of: dict[int, tuple[SurfaceCells, CellModes]] = {}
         self.process = self._process(length) if whole_waves else None
 
     def _process(self, length: float) -> Float[np.ndarray, "C"]:
@@ -89,7 +97,8 @@ class DrawnCells:
     def _displaced(self, c: int) -> Float[np.ndarray, "K"]:
         """Returns of a cell that is off as a whole, metres."""
         at = self.pixels[c]
-        return self._returns(at, self.scene.depth[at] - BAD_DEPTH * self.rng.random())
+        surface = self.scene.depth[at] + self.phi[c] @ self.shared
+        return self._returns(at, surface - BAD_DEPTH * self.rng.random())
 
     def _returns(self, at, depth: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
         """Of a surface at these depths, metres."""
@@ -106,7 +115,8 @@ class DrawnCells:
         seen = returns > self.frame.front[at]
         if not seen.any():
             return None
-        behind = max(np.median((returns - self.scene.depth[at])[seen]) - SEEN_THROUGH, 0.0)
+        off = (returns - self.scene.depth[at] - self.phi[c] @ self.shared)[seen]
+        behind = max(np.median(off) - SEEN_THROUGH, 0.0)
         return returns if self.rng.random() < np.exp(-SEEN_THROUGH_NATS * behind) else None
 
     def _standing(self, at) -> bool:
@@ -132,27 +142,31 @@ class DrawnCells:
 
     def _tell(self, c: int, returns: Float[np.ndarray, "K"], mean: float, variance: float, plane: bool) -> None:
         """What the cell's returns tell of the waves there, and of a plane."""
-        found = self._modes(c, returns)
-        if found is None:
+        if not self._look(c, returns):
             return
+        _, found = self.told_of[c]
         share = float(self.frame.amplitudes.bad_share)
         spread = 1 + found.curvature[:, 0] * variance
         apart = (found.place[:, 0] - mean) ** 2 * found.curvature[:, 0] / spread
         good = np.log1p(-share) + found.height[:, 0] - 0.5 * np.log(spread) - 0.5 * apart
-        bad = [np.log1p(-share) + found.outliers[0], np.log(share + 1e-300) + found.bad(np.full(1, -np.inf))[0]]
+        bad = [
+            np.log1p(-share) + found.outliers[0],
+            np.log(share + 1e-300) + found.bad(np.full(1, -np.inf), self.phi[c] @ self.shared)[0],
+        ]
         good = np.exp(good - np.logaddexp.reduce([*good, *bad])) * (not plane)
         tells = good * found.curvature[:, 0] / (1 + found.curvature[:, 0] * self.model)
         self.told[c] = tells.sum()
         self.told_place[c] = tells @ found.place[:, 0] / (self.told[c] + 1e-6)
         self.planes[c] = self._fitted(c, returns, found.place[int(np.argmax(found.height[:, 0])), 0])
 
-    def _modes(self, c: int, returns: Float[np.ndarray, "K"]) -> CellModes | None:
-        """The cell's likelihood as a function of its offset; None where all its returns stand in front."""
+    def _look(self, c: int, returns: Float[np.ndarray, "K"]) -> bool:
+        """The cell's returns, and their likelihood as a function of its offset, into `told_of`; false where all of them
+        stand in front."""
         at = self.pixels[c]
         errors, limits = self.frame.errors, self.frame.limits
         seen = returns > self.frame.front[at]
         if not seen.any():
-            return None
+            return False
         residual = (returns - self.scene.depth[at])[seen][None]
         shape = residual.shape
         noise = self.frame.noise[at][seen][None]
@@ -166,8 +180,28 @@ class DrawnCells:
             np.array([OBJECT]),
             np.zeros((1, 2)),
             np.full((1, 1), -np.inf),
+            np.median(residual, 1),
         )
-        return modes(cells, errors.sigma, errors.p_outlier)
+        self.told_of[c] = cells, modes(cells, errors.sigma, errors.p_outlier)
+        return True
+
+    def shared_error_at(self, v: Int[np.ndarray, "P"], u: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+        """Metres that the object's surface seems to be off at these rows and columns, by the error that its cells
+        share: at its mode, as the density has it for edges. Cells that stand in front say nothing."""
+        if not self.told_of:
+            return np.zeros(len(v))
+        number = sorted(self.told_of)
+        found = CellModes(*(np.concatenate(a, -1) for a in zip(*(self.told_of[c][1] for c in number), strict=True)))
+        medians = np.concatenate([self.told_of[c][0].median for c in number])
+        at = {c: k for k, c in enumerate(number)}
+        beside = Neighbours(
+            *(np.array([at.get(int(side[c]), -1) for c in number]) for side in (self.beside.left, self.beside.above)),
+            self.beside.alike[number],
+        )
+        prior = np.maximum(self.sds**2, 1e-12) if self.sds.any() else np.zeros(3)
+        share, none = float(self.frame.amplitudes.bad_share), np.full(len(number), -np.inf)
+        of = ObjectErrors(found, none, medians, self.phi[number], beside, share, self.model, self.waves, prior)
+        return self.middle.phi(u, v) @ shared_error(of)
 
     def _around_middle(self, c: int, of: int) -> Float[np.ndarray, "K 3"]:
         """1, x and y of the pixels of cell `of`, metres from the middle of cell c."""
@@ -193,7 +227,8 @@ class DrawnCells:
         if self.rng.random() >= _NEW_PLANES:
             return None
         own = phi @ np.append(0.0, SLOPE_SD * self.rng.standard_normal(2))
-        return own - np.median(own - depth) + self.rng.uniform(_NEAREST, _FARTHEST)
+        off = self.phi[c] @ self.shared + self.rng.uniform(_NEAREST, _FARTHEST)
+        return own - np.median(own - depth) + off
 
     def _gone_on(self, c: int, other: int) -> Float[np.ndarray, "3"]:
         """The plane of a neighbour, turned and displaced, about the middle of the cell c."""

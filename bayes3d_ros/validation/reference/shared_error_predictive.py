@@ -7,6 +7,7 @@ Every pixel returns: the mask is taken as given. Returns lie between `near` and 
 
 An object's cells are drawn one after the other, each given the returns of the ones to its left and above, as Vecchia's
 approximation has them: so waves are of the very density that scores them (`whole_waves` draws the Gaussian process).
+Edges are drawn after them, about surfaces that are off by the error that the cells seem to share.
 
 What of the density is not normalised, over images of one scene (measured on the scenes of `calibration-shared`):
 - a return near an outline may lie up to `LOST_DEPTH` behind its surface, uniformly; where that is beyond `far`, or in
@@ -86,15 +87,18 @@ def sample_shared_depth(
     )
     seen = np.full(depth.shape, np.nan)
     edge = outlines.edge
-    seen[edge] = _edge_inliers(rng, scene, edge, frame)
     table = (label == TABLE) & ~edge
     rows, columns = (np.arange(n) // frame.block for n in depth.shape)
     offset = errors.table * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns]
     seen[table] = (depth + offset + frame.noise * rng.standard_normal(depth.shape))[table]
-    observed = with_outliers(rng, seen, frame)
+    objects, shared = seen.copy(), depth.copy()
     for k in np.unique(label[(label >= OBJECT) & ~edge]):
-        DrawnCells(rng, scene, (label == k) & ~edge, frame, whole_waves).draw(observed)
-    return observed
+        cells = DrawnCells(rng, scene, (label == k) & ~edge, frame, whole_waves)
+        cells.draw(objects)
+        v, u = np.nonzero(label == k)
+        shared[v, u] += cells.shared_error_at(v, u)
+    seen[edge] = _edge_inliers(rng, scene._replace(depth=shared), edge, frame)
+    return np.where((label >= OBJECT) & ~edge, objects, with_outliers(rng, seen, frame))
 
 
 def _edge_inliers(
