@@ -9,21 +9,22 @@ image, a square of a few pixels:
     z = d + phi . a_object + w_cell + b_cell + e,    e ~ p_out a(z) + (1 - p_out) N(0, sigma_i^2 / |r|^2).
 
 b ~ N(0, tau^2) is the error of a cell: of the table's surface as the camera sees it, or of an object's model. With
-probability pi an object's cell is bad (dents, wear, bled edges). Half of the bad ones are off as a whole,
-b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras do not see through solids. The other half are planes of their
-own, as blocks of unknown things are (`own_plane.py`): dents have slopes. Their density is times
-exp(-`SEEN_THROUGH_NATS` x) where their median lies more than `SEEN_THROUGH` behind the surface, x metres more.
+probability pi an object's cell is bad (dents, wear, bled edges), about the surface d + phi . a_object. Half of the bad
+ones are off as a whole, b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras do not see through solids. The other
+half are planes of their own, as blocks of unknown things are (`own_plane.py`): dents have slopes. Their density is
+times exp(-`SEEN_THROUGH_NATS` x) where their median lies more than `SEEN_THROUGH` behind that surface, x metres more.
 a_object ~ N(0, diag(bias^2, lean^2, lean^2)) is a depth error that the whole object shares, with phi = (1, x, y),
 metres from the middle of its visible part: no object stands upright to the degree. w are waves over the object, a
 Gaussian process with covariance wave^2 exp(-distance / length), by Vecchia's approximation (Vecchia 1988,
 doi 10.1111/j.2517-6161.1988.tb01729.x): the density of a cell is that given the ones to its left and above, as far as
 these are good, so that the product over cells is a density whatever it approximates.
 
-A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is the mixture of
-`density.py`, in which each point is as wide as its surface's errors make it and as likely as a blur of the image says
-(outlines of depth images are off by a part of a pixel, and alike along an object). A share of the density is for
-returns between the window's front and back, and, with probability pi, for returns up to `BAD_DEPTH` in front of an
-object.
+A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is that given the cells: the
+mixture of `density.py` about the objects' surfaces d + phi . a_object, with a_object at the mode that the object's
+cells give it. Each point of the mixture is as wide as its surface's errors make it (an object's: bias, w and b) and as
+likely as a blur of the image says (outlines of depth images are off by a part of a pixel, and alike along an object). A
+share of the density is for returns between the window's front and back, and, with probability pi, for returns up to
+`BAD_DEPTH` in front of an object.
 
 Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
 behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else
@@ -50,8 +51,8 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 
 # These change the posterior.
 BAD_DEPTH = 0.02  # metres towards the camera
-# Metres behind an object's surface up to which its cells may be planes of their own at no cost; nats a metre beyond:
-# a sharp limit would make the density jump.
+# Metres behind an object's surface, as its shared error has it, up to which its cells may be planes of their own at no
+# cost; nats a metre beyond: a sharp limit would make the density jump.
 SEEN_THROUGH, SEEN_THROUGH_NATS = 0.007, 5000.0
 OUTLINE_NATS = 1.3  # a side; there are some e^(0.97 L) outlines of length L: with less the prior has no sum
 SEAM_NATS = 5.0  # a side

@@ -39,8 +39,10 @@ def log_edges(
     image: ScoredImage,
     errors: SharedErrorImage,
     node: int,
+    scale: float,
 ) -> Float[np.ndarray, "E"]:
-    """log density of each edge pixel's return."""
+    """log density of each edge pixel's return. depth: with the errors that objects' cells share; scale: of the
+    amplitudes of objects."""
     amplitudes, nodes = errors.amplitudes, errors.nodes
     sigma, p = float(nodes.sigma[node]), float(nodes.p_outlier[node])
     v, u = np.nonzero(edge)
@@ -49,6 +51,7 @@ def log_edges(
     norm2, outlier = 1 + a * a + b * b, float(image.outlier_scale) * observed**2
     noise = sigma * errors.spread[v, u].astype(np.float64)
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
+    of_object *= scale**2
     of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
     window = []
     for dv, du in around():
@@ -111,12 +114,11 @@ def log_density(
     for s in range(len(nodes.sigma)):
         fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
         fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
-        fixed += log_edges(seen, label, kinds.edge, image, errors, s).sum()
         for t, sd in enumerate(nodes.table.astype(float)):
             found[s, t] += fixed + table[s].normal(0.0, sd).sum()
-        for thing in objects.values():
-            for a in range(len(nodes.scale)):
-                found[s, :, a] += log_object(thing.at[s][a])
+        for a, scale in enumerate(nodes.scale.astype(float)):
+            found[s, :, a] += log_edges(seen, label, kinds.edge, image, errors, s, scale).sum()
+            found[s, :, a] += sum(log_object(thing.at[s][a]) for thing in objects.values())
     return found.reshape(len(nodes.sigma), -1)
 
 

@@ -197,24 +197,30 @@ def _finish(edges, sigma, p, bad, share, full):
 
 @strict
 def add_edges(edges, used, picture, depth, label, stride, nodes, sums):
-    """Add the log densities of the returns in the first slots to the rows of sums that they belong to."""
-    sigma, p_outlier, table, _, amplitudes = nodes
+    """Add the log densities of the returns in the first slots to the rows of sums that they belong to: pairs of noise,
+    and for each of them the scales."""
+    sigma, p_outlier, table, scale, amplitudes = nodes
     if used == 0:
         return
-    full, tables = whole_vectors(used), len(table)
-    of_object = f32(amplitudes.bias**2 + amplitudes.wave**2 + amplitudes.model**2)
-    of_table, blur = table[tables // 2] * table[tables // 2], f32(amplitudes.edge_blur)
+    full, scales = whole_vectors(used), len(scale)
+    of_table, blur = table[len(table) // 2] ** 2, f32(amplitudes.edge_blur)
     _repeat_last(edges, used, full)
     _pick(edges, depth, label, stride, full)
     _measure(edges, f32(1.0) / picture.focal_x, f32(1.0) / picture.focal_y, full)
     if blur > 0:
         one = exp(f32(-0.5) / (blur * blur))
         _blur(edges, one, one * one, full)
-    for s in range(len(sigma)):
+    for first in range(len(sigma)):
+        if first > 0 and sigma[first] == sigma[first - 1]:
+            continue  # done with the pair before
         if blur <= 0:
-            _near(edges, sigma[s], full)
-        _mix(edges, sigma[s], of_table, of_object, full)
-        _finish(edges, sigma[s], p_outlier[s], f32(amplitudes.bad_share), f32(amplitudes.edge_share), full)
-        for c in range(used):
-            for t in range(tables):
-                sums[edges.place_of_sum[c], s * tables + t] += edges.value[c]
+            _near(edges, sigma[first], full)
+        for a in range(scales):
+            of_object = f32(scale[a] ** 2 * (amplitudes.bias**2 + amplitudes.wave**2 + amplitudes.model**2))
+            _mix(edges, sigma[first], of_table, of_object, full)
+            s = first
+            while s < len(sigma) and sigma[s] == sigma[first]:
+                _finish(edges, sigma[s], p_outlier[s], f32(amplitudes.bad_share), f32(amplitudes.edge_share), full)
+                for c in range(used):
+                    sums[edges.place_of_sum[c], s * scales + a] += edges.value[c]
+                s += 1

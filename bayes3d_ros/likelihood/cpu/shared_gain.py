@@ -106,7 +106,7 @@ def _gain_of(
         )  # fmt: skip
         score_edges(
             picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes, edges,
-            former_fixed, False,
+            former_old, False,
         )  # fmt: skip
     for k in range(count):
         for level in range(fixed.shape[1]):
@@ -129,7 +129,7 @@ def _gain_of(
         warp[0] = error[0] - warp[1] * column - warp[2] * row
         shift_new(now, size, stride, left, top, warp)
     score_edges(
-        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, fixed, True
+        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, old, True
     )  # fmt: skip
     for s in range(pairs):
         for a in range(scales):

@@ -110,6 +110,7 @@ def _edge_inliers(
     norm2 = 1 + a * a + b * b
     amplitudes = frame.amplitudes
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
+    of_object *= frame.errors.scale**2
     window = []
     for dv, du in around():
         y, there = shifted(scene.depth, dv, du, np.inf)[v, u], shifted(scene.label, dv, du, NOTHING)[v, u]
