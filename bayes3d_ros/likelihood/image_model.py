@@ -70,20 +70,21 @@ def gain(
     scenes: Float[Array, "A Hp Wp"],
     context: tuple[ScoredImage, LibraryArrays, Table],
     window: int,
-) -> tuple[Float[Array, "N S P"], Float[Array, "N 3"]]:
+) -> tuple[Float[Array, "N S P"], Float[Array, "N 4"]]:
     """log p(image | scene and object) - log p(image | scene) at each node; and the error that the object's returns
-    share, at its mode: metres at the image's first pixel, and what a column and a row add."""
+    share, at its mode: metres at the image's first pixel, what a column and a row add, and metres at the middle of what
+    is seen of the object."""
     image, library, table = context
     if isinstance(model, NoiseGrid):
         alone = log_likelihood_gain(placement, ancestor, scenes, image, library, table, model.coarse, window)
-        return alone, jnp.zeros((len(ancestor), 3))
+        return alone, jnp.zeros((len(ancestor), 4))
     hypotheses = hypotheses_of(placement, library, table)
     return shared_kernel()(hypotheses, SceneDepths(scenes, ancestor), image, library, model.image)
 
 
 def with_object(
     placement: Placement,
-    warp: Float[Array, "N 3"],
+    warp: Float[Array, "N 4"],
     scenes: Float[Array, "N Hp Wp"],
     context: tuple[ScoredImage, LibraryArrays, Table],
     window: int,

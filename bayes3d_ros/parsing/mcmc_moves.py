@@ -53,7 +53,7 @@ class Proposed(NamedTuple):
     log_likelihood: Float[Array, "N"]  # noise integrated out
     log_q: Float[Array, "N"]  # of the new object
     log_ratio: Float[Array, "N"]  # of the target, per the ancestor's, to q
-    warp: Float[Array, "N 3"]  # the error that the object's returns share, see `image_model.gain`
+    warp: Float[Array, "N 4"]  # the error that the object's returns share, see `image_model.gain`
     lineage: Int[Array, "N"] | None = None  # which draw from q the new object descends from, by copies and small moves
     solo_gain: Float[Array, "N M"] | None = None  # nats that each object alone gains over the empty table
 

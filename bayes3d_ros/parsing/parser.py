@@ -230,13 +230,15 @@ class SceneParser:
         slots = max(self.settings.max_objects, 1)  # those beyond are empty
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
-        objects, gauss, log_weight, noise, log_evidence, lineage = jax.device_get(
-            (state.objects, gauss, state.log_weight, noise, state.log_evidence, state.lineage)
+        objects, gauss, off, log_weight, noise, log_evidence, lineage = jax.device_get(
+            (state.objects, gauss, state.warp[..., -1], state.log_weight, noise, state.log_evidence, state.lineage)
         )
-        objects, lineage = jax.tree.map(lambda a: a[:, :slots], (objects, lineage))
-        gauss = gauss[:, : slots + 1]
+        objects, off, lineage = jax.tree.map(lambda a: a[:, :slots], (objects, off, lineage))
+        gauss = gauss[:, : slots + 2]
         things: list[tuple[UnknownThing, ...]] = [()] * len(log_weight)
-        stage = Stage(objects, gauss, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), things, lineage)
+        stage = Stage(
+            objects, gauss, off, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), things, lineage
+        )
         return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
 
     def _with_things(self, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation) -> Stage:
@@ -277,8 +279,8 @@ class SceneParser:
             reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
             if not reached or (not settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
-        outline = settings.outline_sigma if settings.shares_errors else 0.0
-        return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline)
+        outline, bias = (settings.outline_sigma, settings.surface_bias) if settings.shares_errors else (0.0, 0.0)
+        return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline, bias)
 
     def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):
         """Depth and labels of the best scene at the input's size."""
@@ -297,9 +299,9 @@ def _of_types(arrays: LibraryArrays, library: Library, types: tuple[str, ...]) -
     return arrays._replace(possible=jnp.asarray(possible))
 
 
-def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M1 3"]:
-    """Standard normal numbers for the errors of the table and of each object, for every scene."""
-    return jax.random.normal(key, (shape[0], shape[1] + 1, 3))
+def _errors_of_samples(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "N M2 3"]:
+    """Standard normal numbers for the errors of the table, two rows, and of each object, for every scene."""
+    return jax.random.normal(key, (shape[0], shape[1] + 2, 3))
 
 
 def frame_key(seed: int, stamp_ns: int) -> PRNGKeyArray:

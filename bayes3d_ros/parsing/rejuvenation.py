@@ -37,7 +37,7 @@ class WeightedScenes(NamedTuple):
     objects: Placement  # [N, M]
     solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
     lineage: Int[Array, "N M"]  # which draw of its stage an object descends from; moves here do not change it
-    warp: Float[Array, "N M 3"]  # the error that an object's returns share, see `image_model.gain`
+    warp: Float[Array, "N M 4"]  # the error that an object's returns share, see `image_model.gain`
     scenes: Float[Array, "N Hp Wp"]  # padded depth, with these errors
     loglik_grid: Float[Array, "N S P"]
     log_likelihood: Float[Array, "N"]

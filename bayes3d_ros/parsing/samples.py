@@ -28,8 +28,9 @@ class Stage(NamedTuple):
 
     objects: Placement
     gauss: Float[
-        np.ndarray, "N M1 3"
-    ]  # standard normal: for the table's two tilts and height, then for each object's picture
+        np.ndarray, "N M2 3"
+    ]  # standard normal: for the table's two tilts and height, its bias, then for each object's picture
+    off: Float[np.ndarray, "N M"]  # metres that the returns of each object lie behind it, against the table's
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]
     sigma: Float[np.ndarray, "N"]
@@ -43,8 +44,8 @@ class Stage(NamedTuple):
         kinds = Placement(np.int32, np.int32, np.float32, np.float32, np.float32)  # type: ignore[arg-type]
         objects = jax.tree.map(lambda kind: np.zeros((0, slots), kind), kinds)
         zero = np.zeros(0, np.float32)
-        gauss, lineage = np.zeros((0, slots + 1, 3), np.float32), np.zeros((0, slots), np.int32)
-        return cls(objects, gauss, zero, zero, zero, log_evidence, [], lineage)
+        gauss, lineage = np.zeros((0, slots + 2, 3), np.float32), np.zeros((0, slots), np.int32)
+        return cls(objects, gauss, np.zeros((0, slots), np.float32), zero, zero, zero, log_evidence, [], lineage)
 
 
 def mixture(
@@ -55,10 +56,12 @@ def mixture(
     table: Table,
     seen: SeenTable,
     outline: float,
+    bias: float,
 ) -> tuple[SceneSamples, float, list[tuple[UnknownThing, ...]]]:
     """The mixture of the stages, p(n | image) ~ P(n) Z_n; log p(image) - log p(image | empty); and the unknown
     things of each sample. counts: numbers of known objects of the stages; outline: standard deviation of the
-    displacement of an object's picture, as an angle's tangent."""
+    displacement of an object's picture, as an angle's tangent; bias: of the depth of an object's returns against the
+    table's, metres."""
     log_z = np.array([s.log_evidence for s in stages])
     log_evidence = np.logaddexp.reduce(log_prior + log_z)
     log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
@@ -74,12 +77,14 @@ def mixture(
     lineage = _apart([s.lineage for s in stages])[keep]
     keep, table_error = np.repeat(keep, 2), gauss[:, 0] * seen.error_sd + seen.error
     objects = _beside_pictures(
-        jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 1:], library, table, outline
+        jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 2:], library, table, outline
     )
     things = [held for held in things for _ in range(2)]
     moved = _moved(table_error)
     held = np.arange(objects.type.shape[1]) < n[keep, None]
     T = np.asarray(table.T_camera_table, np.float64) @ moved @ _T_table_object(objects, library)
+    off = np.concatenate([s.off for s in stages])[keep]
+    T = _along_rays(T, _table_bias(off, held, gauss[:, 1, 0], bias))
     known = _Slots(
         type=np.where(held, objects.type, -1),
         face=np.where(held, objects.face, -1),
@@ -140,6 +145,27 @@ def _beside_pictures(
     turn = sd / np.maximum(np.linalg.norm(size, axis=-1) / 12**0.5, 1e-3)
     x, y = pictures.x + sd * gauss[..., 0], pictures.y + sd * gauss[..., 1]
     return pictures._replace(x=x, y=y, yaw=np.mod(pictures.yaw + turn * gauss[..., 2], 2 * np.pi))
+
+
+def _table_bias(
+    off: Float[np.ndarray, "S M"], held: Bool[np.ndarray, "S M"], gauss: Float[np.ndarray, "S"], bias: float
+) -> Float[np.ndarray, "S"]:
+    """Metres that the table's returns are too near, drawn given how far behind each object its returns are.
+
+    The likelihood sees an object's depth error against the table's returns: the table's own error is half of the
+    variance bias^2, and common to all objects; the other half is each object's own. The table's error given those of n
+    objects is normal with mean n / (n + 1) times their mean and variance bias^2 / (2 (n + 1)).
+    """
+    number = held.sum(1)
+    return ((off * held).sum(1) + bias * np.sqrt((number + 1) / 2) * gauss) / (number + 1)
+
+
+def _along_rays(T: Float[np.ndarray, "S M 4 4"], depth: Float[np.ndarray, "S"]) -> Float[np.ndarray, "S M 4 4"]:
+    """Poses moved away from the camera, so that their depth grows by so many metres and their pictures stay."""
+    moved = T.copy()
+    z = np.where(T[..., 2, 3] > 0, T[..., 2, 3], np.inf)
+    moved[..., :3, 3] *= (1 + depth[:, None] / z)[..., None]
+    return moved
 
 
 class _Slots(NamedTuple):

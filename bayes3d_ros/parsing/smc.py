@@ -45,7 +45,7 @@ class Population(NamedTuple):
     objects: Placement  # [N, M]
     solo_gain: Float[Array, "N M"]  # nats that each object alone gains over the empty table
     lineage: Int[Array, "N M"]  # which draw of its stage an object descends from, by copies and small moves
-    warp: Float[Array, "N M 3"]  # the error that an object's returns share, see `image_model.gain`
+    warp: Float[Array, "N M 4"]  # the error that an object's returns share, see `image_model.gain`
     scenes: Float[Array, "N Hp Wp"]  # padded depth, as the camera shows it: with these errors
     loglik_grid: Float[Array, "N S P"]  # log p(image | scene, noise) on the coarse grid, up to one constant
     log_likelihood: Float[Array, "N"]  # noise integrated out
@@ -78,7 +78,7 @@ def init(
         objects=Placement(none, none, zero, zero, zero),
         solo_gain=zero,
         lineage=none,
-        warp=jnp.zeros((*slots, 3)),
+        warp=jnp.zeros((*slots, 4)),
         scenes=everywhere(empty.scene),
         loglik_grid=everywhere(empty.loglik_grid),
         log_likelihood=everywhere(empty.log_likelihood),

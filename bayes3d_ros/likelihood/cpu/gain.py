@@ -58,7 +58,7 @@ def shared_gain(
     image: ScoredImage,
     library: LibraryArrays,
     errors: SharedErrorImage,
-) -> tuple[Float[Array, "N S TA"], Float[Array, "N 3"]]:
+) -> tuple[Float[Array, "N S TA"], Float[Array, "N 4"]]:
     """log p(image | scene and object) - log p(image | scene) of each hypothesis at each node, and the mode of the new
     object's shared error: metres of depth at the image's first pixel, and what a column and a row add."""
     nodes, count = errors.nodes, len(hypotheses.type)

@@ -33,7 +33,8 @@ from bayes3d_ros.likelihood.cpu.xla_ffi import answered_version, float_results, 
 
 SHARED_GAIN_TARGET = "bayes3d_shared_gain_of_hypotheses"
 REACH = 4  # pixels from one that a hypothesis changes, to which its outlines, and what goes on there, matter
-WARP = 3  # numbers of the shared error of an object: metres at the image's first pixel, a column, a row
+# Numbers of the shared error of an object: metres at the image's first pixel, a column, a row; metres at the middle.
+WARP = 4
 
 
 @strict
@@ -127,6 +128,7 @@ def _gain_of(
         log_objects(own, rows, new_cells, scale, amplitudes, error, of_cells)
         warp[1], warp[2] = error[1] * metres, error[2] * metres
         warp[0] = error[0] - warp[1] * column - warp[2] * row
+        warp[3] = error[0]
         shift_new(now, size, stride, left, top, warp)
     score_edges(
         picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, old, True

@@ -212,7 +212,7 @@ def log_likelihood_of(
 @partial(jax.jit, static_argnames="window")
 def _gains(
     model: SharedErrors, objects: Placement, scene: Float[Array, "1 Hp Wp"], context: Context, window: int
-) -> tuple[Float[Array, "M S P"], Float[Array, "M 3"]]:
+) -> tuple[Float[Array, "M S P"], Float[Array, "M 4"]]:
     return gain(model, objects, jnp.zeros(objects.x.shape, jnp.int32), scene, context, window)
 
 
