@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """The nodes at which the parameters of an image's errors are summed (`shared_errors.py`): sigma, p_out, the standard
-deviation tau of the table's cells, and the scale of the objects' amplitudes.
+deviation tau of the table's cells, and the scale of each object's amplitudes.
 
 The table's returns nearly settle the first three (log sigma to a per cent or less). So the posterior given the table's
 returns alone is found first, as a normal density of log sigma, logit p_out and log tau, by expectation and maximisation
@@ -34,13 +34,15 @@ _WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations if the table says not
 
 
 class ErrorNodes(NamedTuple):
-    """S pairs of noise, T amplitudes of the table and A scales of the objects' amplitudes, in all combinations."""
+    """S pairs of noise and T amplitudes of the table, in all combinations; and A scales of the amplitudes of an object,
+    over which its own density is summed."""
 
     sigma: Float[np.ndarray, "S"]  # metres, at the reference depth
     p_outlier: Float[np.ndarray, "S"]
     table: Float[np.ndarray, "T"]  # metres
     scale: Float[np.ndarray, "A"]
-    log_weight: Float[np.ndarray, "S TA"]
+    log_weight: Float[np.ndarray, "S T"]
+    log_scale: Float[np.ndarray, "A"]  # log weights of the scales: they sum to one
 
 
 class TableErrors(NamedTuple):
@@ -80,9 +82,9 @@ def error_nodes(
     log_tables = np.log(weights)
     if wave > 0:
         log_tables = log_tables + 0.5 * places**2 - 0.5 * ((np.log(tables / wave)) / AMPLITUDE_LOG_SD) ** 2
-    log_weight = log_noise[:, None] + (log_tables[:, None] + np.log(weights)).ravel()
+    log_weight = log_noise[:, None] + log_tables
     scale = np.exp(AMPLITUDE_LOG_SD * places)
-    return ErrorNodes(*(a.astype(np.float32) for a in (sigma, p_outlier, tables, scale, log_weight)))
+    return ErrorNodes(*(a.astype(np.float32) for a in (sigma, p_outlier, tables, scale, log_weight, np.log(weights))))
 
 
 def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErrors:
@@ -152,7 +154,7 @@ def _grown(which: Bool[np.ndarray, "H W"], by: int) -> Bool[np.ndarray, "H W"]:
     return ndimage.maximum_filter(which, 2 * by + 1, mode="constant", cval=False)
 
 
-def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S TA"]) -> Noise:
+def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S T"]) -> Noise:
     """sigma and p_outlier of each scene given the image: drawn from the table's normal density, moved by what the
     scene's own likelihood at the four pairs of nodes adds to the table's."""
     log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1).reshape(-1, 2, 2)

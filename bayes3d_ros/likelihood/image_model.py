@@ -40,7 +40,7 @@ class SharedErrors(NamedTuple):
     """`shared_errors.py` for one image, and the log likelihood of the empty table at each node."""
 
     image: SharedErrorImage
-    empty: Float[Array, "1 S TA"]  # up to a constant
+    empty: Float[Array, "1 S T"]  # up to a constant
 
 
 ImageModel = NoiseGrid | SharedErrors

@@ -35,8 +35,9 @@ unknown (`own_plane.py`); so does one beside it at which its depth goes on, behi
 unknown things have the prior exp(-`OUTLINE_NATS` L), L their length in pixels' sides, and another `SEAM_NATS` for each
 side at which depth goes on from the unknown thing to returns of a known one: things end where depth jumps.
 
-sigma, p_out, the table's tau and a scale of all amplitudes of objects are integrated over nodes (`error_nodes.py`),
-jointly with the scene. Blocks depend on the image alone.
+sigma, p_out and the table's tau are integrated over nodes (`error_nodes.py`), jointly with the scene; a scale of the
+amplitudes of each object within its own density, that of its cells and of the edges about it. Where an object hides a
+part of an earlier one, the earlier one's scale is integrated block by block. Blocks depend on the image alone.
 """
 
 from typing import NamedTuple

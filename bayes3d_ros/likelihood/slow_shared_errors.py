@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
@@ -99,7 +100,7 @@ def log_unknown(
 
 def log_density(
     depth: Float[np.ndarray, "H W"], label: Int[np.ndarray, "H W"], image: ScoredImage, errors: SharedErrorImage
-) -> Float[np.ndarray, "S TA"]:
+) -> Float[np.ndarray, "S T"]:
     """log p(image | scene) at each node, up to a constant of the image. depth: metres, inf where there is nothing;
     label: NOTHING, TABLE or OBJECT + k."""
     depth = np.asarray(depth, np.float64)
@@ -107,19 +108,28 @@ def log_density(
     cells = cells_of(depth, label, kinds, image, errors)
     nodes, lost = errors.nodes, LOST_SHARE * float(errors.amplitudes.edge_share)
     mask = mask_nats(kinds.unknown, kinds.of_object, image) if errors.amplitudes.unknown else 0.0
-    found = np.zeros((len(nodes.sigma), len(nodes.table), len(nodes.scale)))
+    found = np.zeros((len(nodes.sigma), len(nodes.table)))
     table = modes_at_nodes(_take(cells, cells.label == TABLE), errors)
     objects = objects_of(cells, depth, label, kinds, image, errors)
-    seen = with_shared_errors(depth, label, objects)
+    seen, about = with_shared_errors(depth, label, objects), last_object(label)[kinds.edge]
     for s in range(len(nodes.sigma)):
         fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
         fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
         for t, sd in enumerate(nodes.table.astype(float)):
             found[s, t] += fixed + table[s].normal(0.0, sd).sum()
-        for a, scale in enumerate(nodes.scale.astype(float)):
-            found[s, :, a] += log_edges(seen, label, kinds.edge, image, errors, s, scale).sum()
-            found[s, :, a] += sum(log_object(thing.at[s][a]) for thing in objects.values())
-    return found.reshape(len(nodes.sigma), -1)
+        edges = [log_edges(seen, label, kinds.edge, image, errors, s, a) for a in nodes.scale.astype(float)]
+        for k in np.unique(np.append(about, list(objects))):
+            own = [part[about == k].sum() for part in edges]
+            if k in objects:
+                own = [edge + log_object(of) for edge, of in zip(own, objects[k].at[s], strict=True)]
+            found[s] += logsumexp(np.array(own) + nodes.log_scale)
+    return found
+
+
+def last_object(label: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "H W"]:
+    """The last object in each pixel's window, whose scale of errors an edge there has; NOTHING or TABLE where there is
+    none."""
+    return np.max([shifted(label, dv, du, NOTHING) for dv, du in around()], axis=0)
 
 
 class SeenObject(NamedTuple):

@@ -68,7 +68,7 @@ def test_it_is_the_posterior_given_an_empty_table(problem):
     """On a fine grid, from the density itself."""
     objects, number = sample_scene(jax.random.key(5), np.array([0.0, -np.inf]), problem.library, problem.table)
     scene = rendered(objects, number, problem)
-    errors = TrueErrors(0.0015, 0.03, 0.0012, 1.0)
+    errors = TrueErrors(0.0015, 0.03, 0.0012, (1.0, 1.0, 1.0))
     image = simulate_shared_image(np.random.default_rng(5), scene, errors, problem)
     shared = shared_error_image(image, problem.amplitudes, SIGMA_MAX)
     grid = noise_posterior(image, shared, scene, errors)
@@ -91,7 +91,7 @@ def test_objects_hardly_move_it(problem):
     for k in range(6):
         rng, key = np.random.default_rng(k), jax.random.key(k)
         objects, number = sample_scene(key, np.array([-np.inf, 0.0, 0.0]), problem.library, problem.table)
-        errors = TrueErrors(0.0005 * (k + 1), 0.01 * (k + 1), 0.001, 1.0)
+        errors = TrueErrors(0.0005 * (k + 1), 0.01 * (k + 1), 0.001, (1.0, 1.0, 1.0))
         image = simulate_shared_image(rng, rendered(objects, number, problem), errors, problem)
         shared = shared_error_image(image, problem.amplitudes, 0.01)
         cells = _table_cells(image, np.asarray(image.depth) > 0, shared.spread, int(shared.block))
@@ -106,10 +106,13 @@ def test_where_nodes_are(problem):
     """A pair of sigmas with a pair of outliers' shares, one standard deviation to either side, in this order."""
     objects, number = sample_scene(jax.random.key(5), np.array([0.0, -np.inf]), problem.library, problem.table)
     image = simulate_shared_image(
-        np.random.default_rng(5), rendered(objects, number, problem), TrueErrors(0.0015, 0.03, 0.0012, 1.0), problem
+        np.random.default_rng(5),
+        rendered(objects, number, problem),
+        TrueErrors(0.0015, 0.03, 0.0012, (1.0, 1.0, 1.0)),
+        problem,
     )
     nodes = error_nodes(image, np.asarray(image.depth) > 0, np.ones(image.depth.shape, np.float32), 4, 0.001, 0.01)
-    assert nodes.log_weight.shape == (4, 9)
+    assert nodes.log_weight.shape == (4, 3)
     assert np.array_equal(np.argsort(nodes.sigma, kind="stable"), np.arange(4))
     for axis, value in ((0, np.log(nodes.sigma)), (1, logit(nodes.p_outlier.astype(float)))):
         middle = value.mean()
@@ -133,6 +136,7 @@ def test_noise_is_drawn_about_what_the_scene_moves_it_to(slopes):
         np.ones(1, np.float32),
         np.ones(3, np.float32),
         weight,
+        np.zeros(3, np.float32),
     )
     value = jnp.asarray(np.repeat((pairs @ slopes)[:, None], 3, 1)[None] + np.log(HERMITE[1]), jnp.float32)
     draws = 4000

@@ -121,7 +121,7 @@ def observed(box, case, seed):
 
 def at_one_node(image, errors):
     one = (np.array([value], np.float32) for value in (SIGMA, P, TABLE_SD, 1.0))
-    nodes = ErrorNodes(*one, np.zeros((1, 1), np.float32))
+    nodes = ErrorNodes(*one, np.zeros((1, 1), np.float32), np.zeros(1, np.float32))
     standing = (image.pixel_class == IN_WORKSPACE) & (image.depth < image.bare_depth - errors.table_margin)
     own_plane = own_plane_log_density(image, standing, errors.spread, int(errors.block), nodes.sigma, nodes.p_outlier)
     return errors._replace(nodes=nodes, own_plane=own_plane)

@@ -37,7 +37,7 @@ def test_the_truth_is_scored_as_the_density_says(problem):
     """Object by object, by the kernel, it is the density of the whole scene."""
     objects, number = sample_scene(jax.random.key(0), ONE, problem.library, problem.table)
     scene = rendered(objects, number, problem)
-    errors = TrueErrors(0.0012, 0.02, 0.001, 1.0)
+    errors = TrueErrors(0.0012, 0.02, 0.001, (1.0, 1.0, 1.0))
     image = simulate_shared_image(np.random.default_rng(0), scene, errors, problem)
     model = model_of(image, problem)
     shared = jax.device_get(model.image)

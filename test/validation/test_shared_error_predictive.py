@@ -34,7 +34,7 @@ FOCAL = np.array([CAMERA.fx, CAMERA.fy])
 RAYS = PinholeRays(*(a.astype(float) for a in (CAMERA.rays()[0, :, 0], CAMERA.rays()[:, 0, 1])), FOCAL)
 LIMITS, SIGMA_MAX = DepthRange(0.3, 1.15), 0.005
 AMPLITUDES = amplitudes_of(ParserSettings(unknown=False))
-ERRORS = TrueErrors(0.0012, 0.05, 0.001, 1.0)
+ERRORS = TrueErrors(0.0012, 0.05, 0.001, (1.0,))
 BARE = 0.85 - 0.003 * np.arange(HEIGHT)[:, None] + np.zeros((HEIGHT, WIDTH))
 WITHOUT_BAD = AMPLITUDES._replace(bad_share=np.float32(0))  # which cut the density off, by tens of nats
 IMAGES = 100
@@ -56,7 +56,9 @@ def log_value(image, scene, errors, amplitudes):
     """log density, with the margin of ERRORS: what is told apart is not the margin."""
     margin = margin_of(ERRORS, spread_of(scene))
     shared = shared_error_image(image, amplitudes, SIGMA_MAX)._replace(table_margin=margin)
-    nodes = ErrorNodes(*(np.array([value]) for value in (*errors,)), np.zeros((1, 1)))
+    nodes = ErrorNodes(
+        *(np.array([value]) for value in errors[:3]), np.array(errors.scale), np.zeros((1, 1)), np.zeros(1)
+    )
     return log_density(scene.depth, scene.label, image, at_nodes(image, shared, nodes))[0, 0]
 
 
@@ -81,7 +83,7 @@ def log_ratios(others, amplitudes=AMPLITUDES, **wrong):
     ("amplitudes", "others"),
     [
         (AMPLITUDES, [(0, {"sigma": 0.00124}), (0, {"p_outlier": 0.057}), (0, {"table": 0.00107})]),
-        (WITHOUT_BAD, [(2e-4, {}), (0, {"scale": 1.1})]),
+        (WITHOUT_BAD, [(2e-4, {}), (0, {"scale": (1.1,)})]),
     ],
     ids=["shipped", "without bad cells"],
 )
@@ -118,7 +120,7 @@ def test_errors_have_their_moments(whole_waves):
     """Cells of one row: waves and the error that the whole plate shares, in closed form."""
     alone = {"lean": 0, "bad_share": 0, "model": 0, "edge_share": 0}
     amplitudes = AMPLITUDES._replace(**{name: np.float32(value) for name, value in alone.items()})
-    errors = TrueErrors(2e-4, 1e-9, 0.002, 2.0)
+    errors = TrueErrors(2e-4, 1e-9, 0.002, (2.0,))
     draws = []
     for k in range(150):
         rng = np.random.default_rng((1, k))
@@ -140,12 +142,11 @@ def test_errors_have_their_moments(whole_waves):
 
 
 def test_errors_are_of_their_priors():
-    drawn = np.array(
-        [sample_errors(np.random.default_rng(k), AMPLITUDES, (1e-3, 2e-3), (0.0, 0.1)) for k in range(300)]
-    ).T
+    errors = [sample_errors(np.random.default_rng(k), AMPLITUDES, (1e-3, 2e-3), (0.0, 0.1), 2) for k in range(300)]
+    drawn = np.array([(*each[:3], *each.scale) for each in errors]).T
     shares = (drawn[0] - 1e-3) / 1e-3, drawn[1] / 0.1
     assert min(kstest(share, "uniform").pvalue for share in shares) > 0.01
-    normal = np.log(drawn[2] / 1e-3) / 0.6, np.log(drawn[3]) / 0.6
+    normal = np.log(drawn[2] / 1e-3) / 0.6, np.log(drawn[3]) / 0.6, np.log(drawn[4]) / 0.6
     assert min(kstest(value, "norm").pvalue for value in normal) > 0.01
 
 
@@ -156,7 +157,7 @@ def noise_ranks(noise_error, monkeypatch):
     ranks = []
     for k in range(8):
         rng = np.random.default_rng((2, k))
-        errors = sample_errors(rng, AMPLITUDES, (5e-4, 5e-3), (0.0, 0.1))
+        errors = sample_errors(rng, AMPLITUDES, (5e-4, 5e-3), (0.0, 0.1), 1)
         depth = sample_shared_depth(rng, scene, RAYS, errors, AMPLITUDES, LIMITS, noise_error=noise_error)
         image = image_of(depth)
         found = noise_posterior(image, shared_error_image(image, AMPLITUDES, SIGMA_MAX), scene, errors)

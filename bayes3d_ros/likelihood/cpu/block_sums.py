@@ -40,7 +40,7 @@ def _labels_of_cells(scene, rectangle, stride, left, top):
 
 @inlined
 def _gather(
-    returns, space, scene, outlier_scale, lost, number, place_of_sum, rectangle, stride, left, top, label, batch, used,
+    returns, space, scene, outlier_scale, lost, number, rectangle, stride, left, top, label, batch, used,
     cell_work,
 ):  # fmt: skip
     """Add the cell of one label in a block, the block's number given, to the batch."""
@@ -72,7 +72,7 @@ def _gather(
     behind = f32(SEEN_THROUGH_NATS) * max(median - f32(SEEN_THROUGH), f32(0.0)) if label == OLD else f32(0.0)
     for s in range(len(batch.own_plane) // w):
         batch.own_plane[s * w + used] = planes[s] - behind if label != TABLE else NO_MODE
-    batch.label[used], batch.place_of_sum[used], batch.block[used] = label, place_of_sum, number
+    batch.label[used], batch.block[used] = label, number
     batch.column[used], batch.row[used], batch.number[used] = column / count, row / count, count
 
 
@@ -83,7 +83,7 @@ def _clear(batch, returns):
         batch.residual[k], batch.precision[k], batch.root[k], batch.outlier[k] = f32(0), f32(1), f32(0), f32(1)
         batch.lost[k] = f32(0)
     for c in range(w):
-        batch.start[c], batch.label[c], batch.place_of_sum[c] = f32(0), 0, 0
+        batch.start[c], batch.label[c], batch.block[c] = f32(0), 0, 0
 
 
 @inlined
@@ -91,13 +91,13 @@ def _add_cells(batch, used, label, sums, column):
     """Add the batch's log likelihoods, of cells of one label, to the rows of sums that they belong to."""
     for c in range(used):
         if batch.label[c] == label:
-            sums[batch.place_of_sum[c], column] += batch.value[c]
+            sums[batch.block[c], column] += batch.value[c]
 
 
 @strict
 def _weigh(batch, used, returns, own, new_cells, nodes, fixed, old):
     """Add the batch's cells to sums; keep those of the new object. Returns how many cells are kept now."""
-    sigma, p_outlier, table, scale, amplitudes = nodes
+    sigma, p_outlier, table, scale, _, amplitudes = nodes
     w, pairs, tables, scales = CELLS_SIDE_BY_SIDE, len(sigma), len(table), len(scale)
     height, place, curvature, outliers = batch.height, batch.place, batch.curvature, batch.outliers
     of_table, of_old, of_new = 0, 0, 0
@@ -139,7 +139,7 @@ def _score_pixels(
     picture, returns, space, scene, rectangle, stride, left, top, nodes, values, place_of_sum, sums
 ):  # fmt: skip
     """Add the log densities of returns that belong to no cell and no edge to sums."""
-    sigma, p_outlier, table, _, amplitudes = nodes
+    sigma, p_outlier, table, _, _, amplitudes = nodes
     u0, u1, v0, v1 = rectangle
     tables = len(table)
     for v in range(v0, v1):
@@ -160,11 +160,21 @@ def _score_pixels(
                     sums[place_of_sum, s * tables + t] += values[s]
 
 
+@inlined
+def _beside_new(label, k, stride):
+    """Whether the window of a pixel shows the new object."""
+    found = False
+    for step in range(9):
+        found |= label[k + (step // 3 - 1) * stride + step % 3 - 1] == NEW
+    return found
+
+
 @strict
-def score_edges(picture, returns, space, scene, blocks, block, stride, left, top, nodes, edges, sums, one_row):
-    """Add the log densities of returns at edges to rows of sums, as `score_blocks` adds those of all others."""
+def score_edges(picture, returns, space, scene, blocks, block, stride, left, top, nodes, edges, old):
+    """Add the log densities of returns at edges to rows of sums: those about the new object to the last row, the others
+    to their block's."""
     height, width = len(picture.ray_y), len(picture.ray_x)
-    across, used = (width + block - 1) // block, 0
+    across, used, of_new = (width + block - 1) // block, 0, len(old) - 1
     for number in blocks:
         v0, u0 = number // across * block, number % across * block
         for v in range(v0, min(v0 + block, height)):
@@ -172,21 +182,21 @@ def score_edges(picture, returns, space, scene, blocks, block, stride, left, top
                 k = (v - top) * stride + u - left
                 if scene.kind[k] != EDGE:
                     continue
-                put_edge(edges, used, picture, returns, u, v, space.depth[k], k, 0 if one_row else number)
+                place = of_new if _beside_new(scene.label, k, stride) else number
+                put_edge(edges, used, picture, returns, u, v, space.depth[k], k, place)
                 used += 1
                 if used == EDGES_SIDE_BY_SIDE:
-                    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
+                    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, old)
                     used = 0
-    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, sums)
+    add_edges(edges, used, picture, scene.depth, scene.label, stride, nodes, old)
 
 
 @strict
 def score_blocks(
     picture, returns, space, scene, blocks, block, stride, left, top, nodes, values, cell_work, batch, own, fixed, old,
-    one_row,
 ):  # fmt: skip
-    """Add the log likelihoods of blocks, without those of edges, to rows of sums: each block to its own row, or, with
-    `one_row`, all to the first. Returns how many cells of the new object were kept."""
+    """Add the log likelihoods of blocks, without those of edges, to their rows of sums. Returns how many cells of the
+    new object were kept."""
     height, width = len(picture.ray_y), len(picture.ray_x)
     across, returns_a_cell = (width + block - 1) // block, block * block
     lost = f32(LOST_SHARE / LOST_DEPTH) * nodes.amplitudes.edge_share
@@ -195,14 +205,13 @@ def score_blocks(
     for number in blocks:
         v, u = number // across * block, number % across * block
         here = (u, min(u + block, width), v, min(v + block, height))
-        place = 0 if one_row else number
-        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, values, place, fixed)
+        _score_pixels(picture, returns, space, scene, here, stride, left, top, nodes, values, number, fixed)
         here_labels = _labels_of_cells(scene, here, stride, left, top)
         for label in range(TABLE, NEW + 1):
             if here_labels >> label & 1 == 0:
                 continue
             _gather(
-                returns, space, scene, picture.outlier_scale, lost, number, place, here, stride, left, top, label,
+                returns, space, scene, picture.outlier_scale, lost, number, here, stride, left, top, label,
                 batch, used, cell_work,
             )  # fmt: skip
             used += 1

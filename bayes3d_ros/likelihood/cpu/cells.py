@@ -42,8 +42,7 @@ class Batch(NamedTuple):
     none: Float[np.ndarray, "K*w"]  # density of a return that is none of the surface's, at one pair of noise
     peak: Float[np.ndarray, "K*w"]  # of a return on the surface, times the share of inliers
     label: Int[np.ndarray, "w"]
-    place_of_sum: Int[np.ndarray, "w"]  # the row of sums that a cell is added to
-    block: Int[np.ndarray, "w"]  # number of the block, by rows
+    block: Int[np.ndarray, "w"]  # number of the block, by rows: of the row of sums that a cell is added to
     column: Float[np.ndarray, "w"]  # mean place of its pixels
     row: Float[np.ndarray, "w"]
     number: Float[np.ndarray, "w"]  # of returns
@@ -69,7 +68,6 @@ def new_batch(returns, pairs):
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.ones(returns * CELLS_SIDE_BY_SIDE, np.float32),
         np.zeros(returns * CELLS_SIDE_BY_SIDE, np.float32),
-        np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.int32),
         np.zeros(CELLS_SIDE_BY_SIDE, np.float32),

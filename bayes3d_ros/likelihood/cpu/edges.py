@@ -199,7 +199,7 @@ def _finish(edges, sigma, p, bad, share, full):
 def add_edges(edges, used, picture, depth, label, stride, nodes, sums):
     """Add the log densities of the returns in the first slots to the rows of sums that they belong to: pairs of noise,
     and for each of them the scales."""
-    sigma, p_outlier, table, scale, amplitudes = nodes
+    sigma, p_outlier, table, scale, _, amplitudes = nodes
     if used == 0:
         return
     full, scales = whole_vectors(used), len(scale)

@@ -58,7 +58,7 @@ def shared_gain(
     image: ScoredImage,
     library: LibraryArrays,
     errors: SharedErrorImage,
-) -> tuple[Float[Array, "N S TA"], Float[Array, "N 4"]]:
+) -> tuple[Float[Array, "N S T"], Float[Array, "N 4"]]:
     """log p(image | scene and object) - log p(image | scene) of each hypothesis at each node, and the mode of the new
     object's shared error: metres of depth at the image's first pixel, and what a column and a row add."""
     nodes, count = errors.nodes, len(hypotheses.type)
@@ -80,6 +80,7 @@ def shared_gain(
         _real(nodes.p_outlier),
         _real(nodes.table),
         _real(nodes.scale),
+        _real(nodes.log_scale),
         _real(jnp.stack([jnp.float32(a) for a in errors.amplitudes])),
         _whole([errors.block, *scenes.depth.shape[1:], image.own_rows]),
     )

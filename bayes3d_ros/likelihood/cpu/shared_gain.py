@@ -60,10 +60,10 @@ def _gain_of(
     things, n, objects, picture, returns, scenes, scene_at, scene_stride, block, nodes, space, patch, now, former,
     batch, own, work, former_sums, gain, warp,
 ):  # fmt: skip
-    sigma, p_outlier, table, scale, amplitudes = nodes
+    log_scale, amplitudes = nodes.log_scale, nodes.amplitudes
     fixed, old, touched, edges, pixel_work, cell_work, rows, of_cells, error = work
     known, former_fixed, former_old = former_sums
-    border, tables, scales = 1, len(table), len(scale)
+    border = 1
     height, width = len(picture.ray_y), len(picture.ray_x)
     rectangle = find_outlines(things, n, objects, picture, space)
     if rectangle[1] <= rectangle[0]:
@@ -88,10 +88,12 @@ def _gain_of(
     across = (width + block - 1) // block
     metres, pixels = find_changes(space, now, former, first, last, patch.changes)
     count = _find_touched(patch.changes, (u0, u1, v0, v1), block, stride, left, top, across, patch.row, touched)
-    fixed[0, :], old[0, :] = mask, 0.0
+    for k in range(count):
+        fixed[touched[k], :], old[touched[k], :] = 0.0, 0.0
+    old[len(old) - 1, :] = 0.0
     new_cells = score_blocks(
         picture, returns, space, now, touched[:count], block, stride, left, top, nodes, pixel_work, cell_work, batch,
-        own, fixed, old, True,
+        own, fixed, old,
     )  # fmt: skip
     # What a block says of the scene as it was is worked out once for all that is added to that scene.
     fresh = 0
@@ -103,41 +105,69 @@ def _gain_of(
     if fresh > 0:
         score_blocks(
             picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes,
-            pixel_work, cell_work, batch, own, former_fixed, former_old, False,
+            pixel_work, cell_work, batch, own, former_fixed, former_old,
         )  # fmt: skip
         score_edges(
             picture, returns, space, former, touched[count : count + fresh], block, stride, left, top, nodes, edges,
-            former_old, False,
+            former_old,
         )  # fmt: skip
-    for k in range(count):
-        for level in range(fixed.shape[1]):
-            fixed[0, level] -= former_fixed[touched[k], level]
-        for level in range(old.shape[1]):
-            old[0, level] -= former_old[touched[k], level]
-    metres = f32(metres / max(pixels, 1) / picture.focal_x)
-    pairs = len(sigma)
     of_cells[:] = 0.0
     if new_cells > 0:
-        column, row = place_cells(own, new_cells, metres)
-        find_neighbours(own, new_cells, across, f32(amplitudes.length))
-        error[:] = 0.0
-        find_bad(own, new_cells, f32(amplitudes.bad_share), error)
-        # One paraboloid for all nodes: about the mode at the middle one.
-        find_shared_error(own, rows, pairs // 2, new_cells, scale[scales // 2], amplitudes, error)
-        find_bad(own, new_cells, f32(amplitudes.bad_share), error)
-        log_objects(own, rows, new_cells, scale, amplitudes, error, of_cells)
-        warp[1], warp[2] = error[1] * metres, error[2] * metres
-        warp[0] = error[0] - warp[1] * column - warp[2] * row
-        warp[3] = error[0]
+        metres = f32(metres / max(pixels, 1) / picture.focal_x)
+        _score_object(own, rows, new_cells, metres, across, nodes, of_cells, error, warp)
         shift_new(now, size, stride, left, top, warp)
-    score_edges(
-        picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, old, True
-    )  # fmt: skip
+    score_edges(picture, returns, space, now, touched[:count], block, stride, left, top, nodes, edges, old)
+    of_new = len(old) - 1
+    for level in range(len(of_cells)):
+        old[of_new, level] += of_cells[level]
+    _add_up(mask, touched[:count], fixed, old, former_fixed, former_old, log_scale, gain)
+
+
+@strict
+def _score_object(own, rows, new_cells, metres, across, nodes, of_cells, error, warp):
+    """log density of the new object's cells at every pair of noise and every scale, and the error that they share."""
+    scale, amplitudes = nodes.scale, nodes.amplitudes
+    middle_pair, middle_scale = len(nodes.sigma) // 2, scale[len(scale) // 2]
+    column, row = place_cells(own, new_cells, metres)
+    find_neighbours(own, new_cells, across, f32(amplitudes.length))
+    error[:] = 0.0
+    find_bad(own, new_cells, f32(amplitudes.bad_share), error)
+    # One paraboloid for all nodes: about the mode at the middle one.
+    find_shared_error(own, rows, middle_pair, new_cells, middle_scale, amplitudes, error)
+    find_bad(own, new_cells, f32(amplitudes.bad_share), error)
+    log_objects(own, rows, new_cells, scale, amplitudes, error, of_cells)
+    warp[1], warp[2] = error[1] * metres, error[2] * metres
+    warp[0], warp[3] = error[0] - warp[1] * column - warp[2] * row, error[0]
+
+
+@strict
+def _add_up(mask, touched, fixed, old, former_fixed, former_old, log_scale, gain):
+    """The gain at every node, from rows of sums of the scene with the new object and without it: a row for each block
+    that is touched, and in `old` a last one for the new object."""
+    scales, of_new = len(log_scale), len(old) - 1
+    pairs = old.shape[1] // scales
+    tables = fixed.shape[1] // pairs
     for s in range(pairs):
-        for a in range(scales):
-            value = old[0, s * scales + a] + of_cells[s * scales + a]
-            for t in range(tables):
-                gain[(s * tables + t) * scales + a] = value + fixed[0, s * tables + t]
+        value = mask + _over_scales(old, of_new, s, log_scale)
+        for here in touched:
+            if old[here, s * scales] != former_old[here, s * scales]:  # an earlier object has changed here
+                value += _over_scales(old, here, s, log_scale) - _over_scales(former_old, here, s, log_scale)
+        for t in range(tables):
+            told = value
+            for here in touched:
+                told += fixed[here, s * tables + t] - former_fixed[here, s * tables + t]
+            gain[s * tables + t] = told
+
+
+@strict
+def _over_scales(values, row, s, log_scale):
+    """log of the mean of densities over the scales of an object's amplitudes, at pair s of noise of a row of sums."""
+    scales, high, total = len(log_scale), -1e300, 0.0
+    for a in range(scales):
+        high = max(high, values[row, s * scales + a] + log_scale[a])
+    for a in range(scales):
+        total += np.exp(values[row, s * scales + a] + log_scale[a] - high)
+    return high + np.log(total)
 
 
 @strict
@@ -153,7 +183,7 @@ def _score_parts(job):
     if begin == end:
         return
     frame = frame_of(job)
-    things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 26)
+    things, planes, whole = things_of(frame), floats(frame, 9), integers(frame, 27)
     block, scene_rows, scene_columns, own_rows = whole[0], whole[1], whole[2], whole[3]
     picture = picture_of(frame, own_rows)
     spread = floats(frame, 18)
@@ -175,15 +205,15 @@ def _score_parts(job):
     blocks = (height // block + 1) * (width // block + 1)
     own = new_object_cells(pairs, blocks)
     work = (
-        np.zeros((1, pairs * tables)), np.zeros((1, pairs * scales)), np.zeros(2 * blocks, np.int64),
+        np.zeros((blocks, pairs * tables)), np.zeros((blocks + 1, pairs * scales)), np.zeros(2 * blocks, np.int64),
         new_edges(), np.zeros(pairs, np.float32),
         (np.zeros(pairs), np.zeros(block * block, np.float32)),
         new_node_rows(blocks), np.zeros(pairs * scales), np.zeros(3),
     )  # fmt: skip
     former_sums = (
-        np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks, pairs * scales)),
+        np.zeros(blocks, np.uint8), np.zeros((blocks, pairs * tables)), np.zeros((blocks + 1, pairs * scales)),
     )  # fmt: skip
-    levels, last = pairs * tables * scales, -1
+    levels, last = pairs * tables, -1
     while begin < end:
         for n in range(begin, end):
             if ancestor[n] != last:

@@ -72,7 +72,7 @@ def shared_scene_row(k: int, problem: SharedProblem, noise_known: bool = False, 
     rng, drawn = np.random.default_rng((SHARED_SEED, k)), np.random.default_rng((SHARED_SEED, k, 1))
     objects, number = sample_scene(scene_key, problem.log_count, problem.library, problem.table)
     sigmas = LEAST_SIGMA, problem.settings.sigma_max
-    errors = sample_errors(drawn, problem.amplitudes, sigmas, (0.0, MOST_OUTLIERS))
+    errors = sample_errors(drawn, problem.amplitudes, sigmas, (0.0, MOST_OUTLIERS), problem.settings.max_objects)
     scene = rendered(objects, number, problem)
     image = simulate_shared_image(drawn, scene, errors, problem, **wrong)
     model = model_of(image, problem, errors if noise_known else None)
@@ -89,7 +89,7 @@ def shared_scene_row(k: int, problem: SharedProblem, noise_known: bool = False, 
     one = jax.tree.map(lambda a: np.asarray(a)[None], objects)
     margin = np.asarray(model.image.table_margin, np.float64)
     row["log_mass"] = round(float(log_masses(one, np.array([number]), margin, problem)[0]), 3)
-    row["errors"] = {"table": round(errors.table, 6), "scale": round(errors.scale, 4)}
+    row["errors"] = {"table": round(errors.table, 6), "scale": [round(scale, 4) for scale in errors.scale]}
     row["nodes"] = {
         name: sorted({float(f"{v:.4g}") for v in np.asarray(getattr(model.image.nodes, name))}) for name in NOISE
     }

@@ -45,6 +45,7 @@ class DrawnCells:
         rng: np.random.Generator,
         scene: RenderedScene,
         own: Bool[np.ndarray, "H W"],
+        scale: float,
         frame: ErrorFrame,
         whole_waves: bool,
     ) -> None:
@@ -57,7 +58,7 @@ class DrawnCells:
         column, row = np.average(middle, axis=0, weights=np.bincount(which))
         self.middle = SeenMiddle(float(column), float(row), scene.depth[own].mean() / float(frame.rays.focal[0]))
         self.metres, self.phi = self.middle.metres, self.middle.phi(*middle.T)
-        scale, amplitudes = frame.errors.scale, frame.amplitudes
+        amplitudes = frame.amplitudes
         self.sds = scale * np.array([float(amplitudes.bias), *2 * (float(amplitudes.lean),)])
         self.shared = rng.standard_normal(3) * self.sds
         share = rng.choice(BAD_SPREAD, p=BAD_WEIGHT) * float(amplitudes.bad_share)
@@ -194,10 +195,10 @@ class DrawnCells:
         found = CellModes(*(np.concatenate(a, -1) for a in zip(*(self.told_of[c][1] for c in number), strict=True)))
         medians = np.concatenate([self.told_of[c][0].median for c in number])
         at = {c: k for k, c in enumerate(number)}
-        beside = Neighbours(
-            *(np.array([at.get(int(side[c]), -1) for c in number]) for side in (self.beside.left, self.beside.above)),
-            self.beside.alike[number],
+        left, above = (
+            np.array([at.get(int(side[c]), -1) for c in number]) for side in (self.beside.left, self.beside.above)
         )
+        beside = Neighbours(left, above, self.beside.alike[number])
         prior = np.maximum(self.sds**2, 1e-12) if self.sds.any() else np.zeros(3)
         share, none = float(self.frame.amplitudes.bad_share), np.full(len(number), -np.inf)
         of = ObjectErrors(found, none, medians, self.phi[number], beside, share, self.model, self.waves, prior)

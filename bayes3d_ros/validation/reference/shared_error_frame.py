@@ -44,7 +44,7 @@ class TrueErrors(NamedTuple):
     sigma: float  # metres, at the bare table's median depth
     p_outlier: float
     table: float  # metres: standard deviation of the table's cells
-    scale: float  # of objects' amplitudes
+    scale: tuple[float, ...]  # of the amplitudes of each object
 
 
 class OutlineMass(NamedTuple):

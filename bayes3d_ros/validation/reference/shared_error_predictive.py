@@ -33,6 +33,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     Amplitudes,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, around, shifted
+from bayes3d_ros.likelihood.slow_shared_errors import last_object
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
 from bayes3d_ros.validation.reference.shared_error_cells import DrawnCells
 from bayes3d_ros.validation.reference.shared_error_frame import (
@@ -49,13 +50,17 @@ from bayes3d_ros.validation.reference.shared_error_frame import (
 
 
 def sample_errors(
-    rng: np.random.Generator, amplitudes: Amplitudes, sigma: tuple[float, float], p_outlier: tuple[float, float]
+    rng: np.random.Generator,
+    amplitudes: Amplitudes,
+    sigma: tuple[float, float],
+    p_outlier: tuple[float, float],
+    objects: int,
 ) -> TrueErrors:
     """From the priors that the nodes stand for: sigma (metres) and p_outlier uniform between these ends, the table's
-    standard deviation and the scale of objects' amplitudes log normal."""
-    table, scale = np.exp(AMPLITUDE_LOG_SD * rng.standard_normal(2))
+    standard deviation and the scale of each object's amplitudes log normal."""
+    table, *scale = np.exp(AMPLITUDE_LOG_SD * rng.standard_normal(1 + objects)).tolist()
     return TrueErrors(
-        float(rng.uniform(*sigma)), float(rng.uniform(*p_outlier)), float(amplitudes.wave) * float(table), float(scale)
+        float(rng.uniform(*sigma)), float(rng.uniform(*p_outlier)), float(amplitudes.wave) * table, tuple(scale)
     )
 
 
@@ -93,7 +98,7 @@ def sample_shared_depth(
     seen[table] = (depth + offset + frame.noise * rng.standard_normal(depth.shape))[table]
     objects, shared = seen.copy(), depth.copy()
     for k in np.unique(label[(label >= OBJECT) & ~edge]):
-        cells = DrawnCells(rng, scene, (label == k) & ~edge, frame, whole_waves)
+        cells = DrawnCells(rng, scene, (label == k) & ~edge, errors.scale[k - OBJECT], frame, whole_waves)
         cells.draw(objects)
         v, u = np.nonzero(label == k)
         shared[v, u] += cells.shared_error_at(v, u)
@@ -110,7 +115,8 @@ def _edge_inliers(
     norm2 = 1 + a * a + b * b
     amplitudes = frame.amplitudes
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
-    of_object *= frame.errors.scale**2
+    scales = np.array([1.0] * OBJECT + list(frame.errors.scale))
+    of_object = of_object * scales[last_object(scene.label)[v, u]] ** 2
     window = []
     for dv, du in around():
         y, there = shifted(scene.depth, dv, du, np.inf)[v, u], shifted(scene.label, dv, du, NOTHING)[v, u]

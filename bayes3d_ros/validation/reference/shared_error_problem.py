@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from scipy.special import logsumexp
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
-from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, HERMITE, ErrorNodes
+from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, ErrorNodes
 from bayes3d_ros.likelihood.image_model import (
     SharedErrors,
     gain,
@@ -297,10 +296,10 @@ def _noise_grid(image, errors, scene: RenderedScene, axes) -> Float[np.ndarray, 
     """log of the posterior, per unit of log sigma, log p_outlier and log of the table's standard deviation."""
     sigma, p, table = axes
     pairs = [a.ravel() for a in np.meshgrid(sigma, p, indexing="ij")]
-    scales, log_scale = np.asarray(errors.nodes.scale), np.log(HERMITE[1])
-    nodes = ErrorNodes(pairs[0], pairs[1], table, scales, np.zeros((len(pairs[0]), len(table) * len(scales))))
+    scales = errors.nodes.scale, errors.nodes.log_scale
+    nodes = ErrorNodes(pairs[0], pairs[1], table, scales[0], np.zeros((len(pairs[0]), len(table))), scales[1])
     found = log_density(scene.depth, scene.label, image, at_nodes(image, errors, nodes))
-    found = logsumexp(found.reshape(len(sigma), len(p), len(table), -1) + log_scale, -1)
+    found = found.reshape(len(sigma), len(p), len(table))
     wave = float(errors.amplitudes.wave)
     log_prior = -0.5 * (np.log(table / wave) / AMPLITUDE_LOG_SD) ** 2
     return found + np.log(sigma)[:, None, None] + np.log(p)[:, None] + log_prior
