@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, SharedErrorImage
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, WIDEST_EDGES, SharedErrorImage
 from bayes3d_ros.likelihood.slow_cells import SurfaceCells, cells_of, lost_density, modes_at_nodes
 from bayes3d_ros.likelihood.slow_object_cells import (
     ObjectErrors,
@@ -52,7 +52,7 @@ def log_edges(
     norm2, outlier = 1 + a * a + b * b, float(image.outlier_scale) * observed**2
     noise = sigma * errors.spread[v, u].astype(np.float64)
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
-    of_object *= scale**2
+    of_object *= min(scale, WIDEST_EDGES) ** 2
     of_table = float(nodes.table[len(nodes.table) // 2]) ** 2
     window = []
     for dv, du in around():

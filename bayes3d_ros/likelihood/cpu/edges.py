@@ -14,7 +14,7 @@ from bayes3d_ros.likelihood.cpu.packing import larger, lesser
 from bayes3d_ros.likelihood.cpu.patches import TABLE
 from bayes3d_ros.likelihood.cpu.windows import exp, log
 from bayes3d_ros.likelihood.density import FAR_AWAY, LATERAL
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, WIDEST_EDGES
 
 EDGES_SIDE_BY_SIDE = 64
 _POINTS = 9  # of a window
@@ -216,7 +216,9 @@ def add_edges(edges, used, picture, depth, label, stride, nodes, sums):
         if blur <= 0:
             _near(edges, sigma[first], full)
         for a in range(scales):
-            of_object = f32(scale[a] ** 2 * (amplitudes.bias**2 + amplitudes.wave**2 + amplitudes.model**2))
+            of_object = f32(
+                min(scale[a], WIDEST_EDGES) ** 2 * (amplitudes.bias**2 + amplitudes.wave**2 + amplitudes.model**2)
+            )
             _mix(edges, sigma[first], of_table, of_object, full)
             s = first
             while s < len(sigma) and sigma[s] == sigma[first]:

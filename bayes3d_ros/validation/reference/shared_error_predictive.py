@@ -30,6 +30,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
     BLOCK_SIDE,
     LEAST_BLOCK,
+    WIDEST_EDGES,
     Amplitudes,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, around, shifted
@@ -115,7 +116,7 @@ def _edge_inliers(
     norm2 = 1 + a * a + b * b
     amplitudes = frame.amplitudes
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
-    scales = np.array([1.0] * OBJECT + list(frame.errors.scale))
+    scales = np.minimum([1.0] * OBJECT + list(frame.errors.scale), WIDEST_EDGES)
     of_object = of_object * scales[last_object(scene.label)[v, u]] ** 2
     window = []
     for dv, du in around():
