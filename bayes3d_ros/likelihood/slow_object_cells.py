@@ -16,6 +16,7 @@ from bayes3d_ros.likelihood.shared_errors import (
     REWEIGHTED_STEPS,
     SEEN_THROUGH,
     SEEN_THROUGH_NATS,
+    Amplitudes,
     SharedErrorImage,
 )
 from bayes3d_ros.likelihood.slow_cells import CellModes, SurfaceCells
@@ -140,7 +141,6 @@ def object_errors(
     amplitudes = errors.amplitudes
     phi = middle.phi(*cells.middle.T)
     column, row = (cells.middle // int(errors.block)).astype(int).T
-    bias2, slope2 = (scale * float(amplitudes.bias)) ** 2, (scale * float(amplitudes.lean)) ** 2
     return ObjectErrors(
         found,
         cells.own_plane[:, node],
@@ -150,8 +150,14 @@ def object_errors(
         float(amplitudes.bad_share),
         (scale * float(amplitudes.model)) ** 2,
         (scale * float(amplitudes.wave)) ** 2,
-        np.maximum([bias2, slope2, slope2], 1e-12) if bias2 + slope2 > 0 else np.zeros(3),
+        shared_variances(scale, amplitudes),
     )
+
+
+def shared_variances(scale: float, amplitudes: Amplitudes) -> Float[np.ndarray, "3"]:
+    """Of the error that an object shares: its offset and slopes; zeros where there is none."""
+    variances = (scale * np.array([float(amplitudes.bias), float(amplitudes.lean), float(amplitudes.lean)])) ** 2
+    return np.maximum(variances, 1e-12) if variances.any() else variances
 
 
 def seen_middle(cells: SurfaceCells, metres: float) -> SeenMiddle:

@@ -111,17 +111,18 @@ def log_density(
     found = np.zeros((len(nodes.sigma), len(nodes.table)))
     table = modes_at_nodes(_take(cells, cells.label == TABLE), errors)
     objects = objects_of(cells, depth, label, kinds, image, errors)
-    seen, about = with_shared_errors(depth, label, objects), last_object(label)[kinds.edge]
+    seen, last = with_shared_errors(depth, label, objects), last_object(label)
     for s in range(len(nodes.sigma)):
         fixed = mask + log_unknown(kinds.unknown, image, errors, s).sum()
         fixed += np.log(float(nodes.p_outlier[s]) + np.where(kinds.near_outline[kinds.hidden], lost, 0)).sum()
+        fixed += log_edges(seen, label, kinds.edge & (last < OBJECT), image, errors, s, 1.0).sum()
         for t, sd in enumerate(nodes.table.astype(float)):
             found[s, t] += fixed + table[s].normal(0.0, sd).sum()
-        edges = [log_edges(seen, label, kinds.edge, image, errors, s, a) for a in nodes.scale.astype(float)]
-        for k in np.unique(np.append(about, list(objects))):
-            own = [part[about == k].sum() for part in edges]
+        for k in np.unique(last[last >= OBJECT]):
+            edge = kinds.edge & (last == k)
+            own = [log_edges(seen, label, edge, image, errors, s, scale).sum() for scale in nodes.scale.astype(float)]
             if k in objects:
-                own = [edge + log_object(of) for edge, of in zip(own, objects[k].at[s], strict=True)]
+                own = [part + log_object(of) for part, of in zip(own, objects[k].at[s], strict=True)]
             found[s] += logsumexp(np.array(own) + nodes.log_scale)
     return found
 

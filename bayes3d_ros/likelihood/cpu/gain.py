@@ -60,7 +60,8 @@ def shared_gain(
     errors: SharedErrorImage,
 ) -> tuple[Float[Array, "N S T"], Float[Array, "N 4"]]:
     """log p(image | scene and object) - log p(image | scene) of each hypothesis at each node, and the mode of the new
-    object's shared error: metres of depth at the image's first pixel, and what a column and a row add."""
+    object's shared error: metres of depth at the image's first pixel, what a column and a row add, and metres at the
+    middle of what is seen."""
     nodes, count = errors.nodes, len(hypotheses.type)
     numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin)
     inputs = (

@@ -208,7 +208,7 @@ def sort_scene(picture, space, patch, scene, changed, stride, size, border):
 @fast
 def shift_new(scene, size, stride, left, top, warp):
     """Add the error that its returns share to the new object's depth. warp: metres at the image's first pixel, and
-    what a column and a row add, first; (left, top): the pixel at place 0."""
+    what a column and a row add; (left, top): the pixel at place 0."""
     depth, label, rows = scene.depth, scene.label, size // stride
     for v in range(u64(rows)):
         first = v * u64(stride)

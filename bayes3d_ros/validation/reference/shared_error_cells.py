@@ -23,6 +23,7 @@ from bayes3d_ros.likelihood.slow_object_cells import (
     SeenMiddle,
     neighbours,
     shared_error,
+    shared_variances,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT
 from bayes3d_ros.validation.reference.shared_error_frame import (
@@ -59,8 +60,8 @@ class DrawnCells:
         self.middle = SeenMiddle(float(column), float(row), scene.depth[own].mean() / float(frame.rays.focal[0]))
         self.metres, self.phi = self.middle.metres, self.middle.phi(*middle.T)
         amplitudes = frame.amplitudes
-        self.sds = scale * np.array([float(amplitudes.bias), *2 * (float(amplitudes.lean),)])
-        self.shared = rng.standard_normal(3) * self.sds
+        self.prior = shared_variances(scale, amplitudes)
+        self.shared = rng.standard_normal(3) * np.sqrt(self.prior)
         share = rng.choice(BAD_SPREAD, p=BAD_WEIGHT) * float(amplitudes.bad_share)
         self.bad_share = min(share, 0.9)
         self.model, self.waves = (scale * float(amplitudes.model)) ** 2, (scale * float(amplitudes.wave)) ** 2
@@ -68,7 +69,7 @@ class DrawnCells:
         self.beside = neighbours(number % across, number // across, self.phi, length)
         self.told, self.told_place = np.zeros((2, len(middle)))
         self.planes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self.told_of: dict[int, tuple[SurfaceCells, CellModes]] = {}
+        self.told_of: dict[int, tuple[float, CellModes]] = {}  # median residual, metres, and likelihood of the offset
         self.process = self._process(length) if whole_waves else None
 
     def _process(self, length: float) -> Float[np.ndarray, "C"]:
@@ -161,8 +162,7 @@ class DrawnCells:
         self.planes[c] = self._fitted(c, returns, found.place[int(np.argmax(found.height[:, 0])), 0])
 
     def _look(self, c: int, returns: Float[np.ndarray, "K"]) -> bool:
-        """The cell's returns, and their likelihood as a function of its offset, into `told_of`; false where all of them
-        stand in front."""
+        """What the cell's returns tell, into `told_of`; false where all of them stand in front."""
         at = self.pixels[c]
         errors, limits = self.frame.errors, self.frame.limits
         seen = returns > self.frame.front[at]
@@ -183,7 +183,7 @@ class DrawnCells:
             np.full((1, 1), -np.inf),
             np.median(residual, 1),
         )
-        self.told_of[c] = cells, modes(cells, errors.sigma, errors.p_outlier)
+        self.told_of[c] = float(cells.median[0]), modes(cells, errors.sigma, errors.p_outlier)
         return True
 
     def shared_error_at(self, v: Int[np.ndarray, "P"], u: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
@@ -193,15 +193,14 @@ class DrawnCells:
             return np.zeros(len(v))
         number = sorted(self.told_of)
         found = CellModes(*(np.concatenate(a, -1) for a in zip(*(self.told_of[c][1] for c in number), strict=True)))
-        medians = np.concatenate([self.told_of[c][0].median for c in number])
+        medians = np.array([self.told_of[c][0] for c in number])
         at = {c: k for k, c in enumerate(number)}
         left, above = (
             np.array([at.get(int(side[c]), -1) for c in number]) for side in (self.beside.left, self.beside.above)
         )
         beside = Neighbours(left, above, self.beside.alike[number])
-        prior = np.maximum(self.sds**2, 1e-12) if self.sds.any() else np.zeros(3)
         share, none = float(self.frame.amplitudes.bad_share), np.full(len(number), -np.inf)
-        of = ObjectErrors(found, none, medians, self.phi[number], beside, share, self.model, self.waves, prior)
+        of = ObjectErrors(found, none, medians, self.phi[number], beside, share, self.model, self.waves, self.prior)
         return self.middle.phi(u, v) @ shared_error(of)
 
     def _around_middle(self, c: int, of: int) -> Float[np.ndarray, "K 3"]:

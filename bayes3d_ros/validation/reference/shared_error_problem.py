@@ -296,8 +296,8 @@ def _noise_grid(image, errors, scene: RenderedScene, axes) -> Float[np.ndarray, 
     """log of the posterior, per unit of log sigma, log p_outlier and log of the table's standard deviation."""
     sigma, p, table = axes
     pairs = [a.ravel() for a in np.meshgrid(sigma, p, indexing="ij")]
-    scales = errors.nodes.scale, errors.nodes.log_scale
-    nodes = ErrorNodes(pairs[0], pairs[1], table, scales[0], np.zeros((len(pairs[0]), len(table))), scales[1])
+    weight = np.zeros((len(pairs[0]), len(table)))
+    nodes = errors.nodes._replace(sigma=pairs[0], p_outlier=pairs[1], table=table, log_weight=weight)
     found = log_density(scene.depth, scene.label, image, at_nodes(image, errors, nodes))
     found = found.reshape(len(sigma), len(p), len(table))
     wave = float(errors.amplitudes.wave)
