@@ -65,10 +65,15 @@ def shared_kernel() -> Callable[..., tuple[Array, Array]]:
 
 
 def depth_kernel() -> Callable[..., Array] | None:
-    """`compiled_depth` on CPUs. Elsewhere, and where it cannot read XLA's call frames, None: the walk of `march.py`
-    does as well."""
-    if jax.default_backend() != "cpu" or not readable():
-        return None
-    from bayes3d_ros.likelihood.cpu.gain import compiled_depth
+    """The kernel that draws depth images where JAX computes by default; None where there is none: the walk of
+    `march.py` does as well."""
+    backend = jax.default_backend()
+    if backend == "cpu" and readable():
+        from bayes3d_ros.likelihood.cpu.gain import compiled_depth
 
-    return compiled_depth
+        return compiled_depth
+    if backend == "gpu":
+        from bayes3d_ros.likelihood.gpu.triton_depth import triton_depth
+
+        return triton_depth
+    return None

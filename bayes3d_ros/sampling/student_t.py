@@ -9,7 +9,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 def stretch(key: PRNGKeyArray, count: int, freedom: float) -> Float[Array, "N 1"]:
     """Factors that turn draws of a normal distribution into draws of a Student t with `freedom` degrees of freedom."""
-    return jnp.sqrt(freedom / jax.random.chisquare(key, freedom, shape=(count, 1)))
+    if freedom == int(freedom):  # a sum of squares: JAX rejects draws of others in a loop, which a GPU waits for
+        square = (jax.random.normal(key, (count, int(freedom))) ** 2).sum(-1, keepdims=True)
+    else:
+        square = jax.random.chisquare(key, freedom, shape=(count, 1))
+    return jnp.sqrt(freedom / square)
 
 
 def draw_standard(key: PRNGKeyArray, count: int, dimensions: int, freedom: float) -> Float[Array, "N D"]:

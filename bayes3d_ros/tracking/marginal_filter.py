@@ -265,7 +265,7 @@ def _all_aligned(
     scale: Float[Array, "6"],
     sigma: Array,
 ) -> tuple[Float[Array, "S 6"], Float[Array, "S 6 6"]]:
-    return jax.lax.map(lambda start: _aligned(chart, start, image, scene, scale, sigma), starts)
+    return jax.vmap(lambda start: _aligned(chart, start, image, scene, scale, sigma))(starts)
 
 
 def _aligned(

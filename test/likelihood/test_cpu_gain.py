@@ -13,6 +13,7 @@ from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.cpu import packing, windows
 from bayes3d_ros.likelihood.cpu.gain import compiled_depth, compiled_gain
 from bayes3d_ros.likelihood.density import Noise
+from bayes3d_ros.likelihood.gpu.triton_depth import triton_depth
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene
@@ -47,8 +48,9 @@ def marched(hypotheses, image, arrays):
     return np.asarray(jnp.minimum(*each)).transpose(2, 0, 1)
 
 
-def test_depth_is_that_of_the_walk(hypotheses, marched, image, arrays):
-    depth = np.asarray(compiled_depth(hypotheses, None, image, arrays))
+@pytest.mark.parametrize("draw", [compiled_depth, triton_depth])
+def test_depth_is_that_of_the_walk(draw, hypotheses, marched, image, arrays):
+    depth = np.asarray(draw(hypotheses, None, image, arrays))
     assert np.isfinite(marched).sum() > 256 * COUNT
     different = ~np.isclose(depth, marched, atol=1e-5)
     assert different.mean() < 2e-4  # rays along an edge, which rounding decides
@@ -61,11 +63,12 @@ def test_a_hypothesis_does_not_depend_on_those_before_it(hypotheses, image, arra
     assert (depth == depth[0]).all()
 
 
-def test_depth_goes_into_the_images_that_there_are(hypotheses, marched, image, arrays):
+@pytest.mark.parametrize("draw", [compiled_depth, triton_depth])
+def test_depth_goes_into_the_images_that_there_are(draw, hypotheses, marched, image, arrays):
     before, after, border = 0.45, np.inf, 2
     start = np.full((COUNT, HEIGHT + 5, WIDTH + 7), before, np.float32)
     start[:, : HEIGHT // 2] = after
-    depth = np.asarray(compiled_depth(hypotheses, jnp.asarray(start), image, arrays, border))
+    depth = np.asarray(draw(hypotheses, jnp.asarray(start), image, arrays, border))
     expected = start.copy()
     inside = np.s_[:, border : border + HEIGHT, border : border + WIDTH]
     expected[inside] = np.minimum(expected[inside], marched)

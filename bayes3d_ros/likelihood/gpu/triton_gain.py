@@ -2,10 +2,11 @@
 
 """Hypotheses rendered and scored in one kernel (Pallas, Triton), for GPUs.
 
-A program takes one hypothesis after the other. It walks the rays of the pixels that the hypothesis can change, puts
-their depth where the windows of its own threads find it again (a patch of a few kilobytes, which stays in the cache),
-and adds up what those pixels say. There are as many patches as programs, not as hypotheses. The walk and the densities
-are those of `likelihood/march.py` and `density.py`, the same functions.
+A program takes one hypothesis after the other, or a strip of its rows where there are few hypotheses. It walks the rays
+of the pixels that the hypothesis can change, puts their depth where the windows of its own threads find it again (a
+patch of a few kilobytes, which stays in the cache), and adds up what those pixels say. There are as many patches as
+programs, not as hypotheses. The walk and the densities are those of `likelihood/march.py` and `density.py`, the same
+functions.
 """
 
 from functools import partial
@@ -18,43 +19,28 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Float, Int
 
 from bayes3d_ros.likelihood.density import NO_RETURN, Noise, Pixels, by_pixel_class, outlier_density, ray_mixture
+from bayes3d_ros.likelihood.gpu.triton_rays import BLOCK_PIXELS, WARPS, RayInputs, depth_of_rays, ray_inputs
 from bayes3d_ros.likelihood.hypotheses import RenderedHypotheses, SceneDepths
-from bayes3d_ros.likelihood.march import (
-    MOST_STEPS,
-    NEAREST_HIT,
-    NO_SURFACE,
-    advance,
-    depth_met,
-    enter_grid,
-    on_its_way,
-)
-from bayes3d_ros.likelihood.plane import plane_depth
+from bayes3d_ros.likelihood.march import NO_SURFACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.tiles import LARGE, tiles_of_objects
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 
-_PROGRAMS = 1024  # at a time, at most
-_BLOCK_PIXELS = 128  # rays, or pixels, that a program's threads look at together
-_WARPS = 4
+_PROGRAMS = 4096  # at a time, at most
+# Strips of rows, by which several programs share a hypothesis where there are few: so many programs, as run at once,
+# and so many rows of the image at least, as a strip renders half a window around it too.
+_AT_ONCE, _STRIP_ROWS = 512, 8
 
 
 class _Inputs(NamedTuple):
     """All of it flat: a kernel's loads are of single elements."""
 
-    words: Any
-    first: Any  # K types
-    dims: Any  # 3 a type
-    origin: Any  # 3 a type
-    size: Any
-    type: Any  # of every object of every hypothesis
-    pose: Any  # 12 each
-    plane: Any  # 4 a hypothesis
     rectangle: Any  # 4 a hypothesis: u, v of the first pixel and one past the last
     depth: Any  # of the image
     pixel_class: Any
     ray_x: Any
     ray_y: Any
-    numbers: Any  # focal 2, centre 2, outlier_scale, front_margin, weight, the camera's rows
+    numbers: Any  # outlier_scale, front_margin, weight
     sigma: Any
     p_outlier: Any
     scenes: Any
@@ -66,6 +52,7 @@ class _Shape(NamedTuple):
 
     hypotheses: int
     objects: int
+    strips: int
     programs: int
     height: int
     width: int
@@ -79,7 +66,7 @@ class _Shape(NamedTuple):
     def patch(self) -> int:
         """Pixels of a program's patch."""
         border = 2 * (self.window // 2)
-        return (self.height + border) * (self.width + border)
+        return (-(-self.height // self.strips) + border) * (self.width + border)
 
 
 @partial(jax.jit, static_argnames=("window", "interpret"))
@@ -101,10 +88,12 @@ def triton_gain(
     columns = pl.next_power_of_2(len(noise.p_outlier))
     # Odds that are not asked for: the last again.
     p_outlier = noise.p_outlier[jnp.minimum(jnp.arange(columns), len(noise.p_outlier) - 1)]
+    strips = max(1, min(height // _STRIP_ROWS, _AT_ONCE // count))
     shape = _Shape(
         hypotheses=count,
         objects=objects,
-        programs=min(count, _PROGRAMS),
+        strips=strips,
+        programs=min(count * strips, _PROGRAMS),
         height=height,
         width=width,
         sigmas=len(noise.sigma),
@@ -113,16 +102,8 @@ def triton_gain(
         scene=() if scenes is None else scenes.depth.shape[1:],
         compiled=not interpret,
     )
-    numbers = (*image.focal, *image.centre, image.outlier_scale, image.front_margin, image.weight, image.own_rows)
+    numbers = (image.outlier_scale, image.front_margin, image.weight)
     inputs = _Inputs(
-        words=library.words,
-        first=library.first,
-        dims=library.dims.astype(jnp.float32).ravel(),
-        origin=library.origin.ravel(),
-        size=library.voxel_size,
-        type=hypotheses.type.ravel(),
-        pose=hypotheses.T_camera_object[..., :3, :].ravel(),
-        plane=hypotheses.plane.ravel(),
         rectangle=_rectangles(hypotheses, image, library, window // 2).ravel(),
         depth=image.depth.ravel(),
         pixel_class=image.pixel_class.ravel(),
@@ -138,14 +119,14 @@ def triton_gain(
         partial(_kernel, shape=shape),
         grid=(shape.programs,),
         out_shape=(
-            jax.ShapeDtypeStruct((count * shape.sigmas * columns,), jnp.float32),
+            jax.ShapeDtypeStruct((count * strips * shape.sigmas * columns,), jnp.float32),
             jax.ShapeDtypeStruct((shape.programs * shape.patch,), jnp.float32),
         ),
-        compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
+        compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=1),
         interpret=bool(interpret),
         name="triton_gain",
-    )(*inputs)
-    return gain.reshape(count, shape.sigmas, columns)[:, :, : len(noise.p_outlier)]
+    )(*ray_inputs(hypotheses, image, library), *inputs)
+    return gain.reshape(count, strips, shape.sigmas, columns).sum(1)[:, :, : len(noise.p_outlier)]
 
 
 def _rectangles(
@@ -166,94 +147,76 @@ def _rectangles(
 
 
 def _kernel(*refs: Any, shape: _Shape) -> None:
-    given, gain, patches = _Inputs(*refs[:-2]), refs[-2], refs[-1]
+    rays, given = RayInputs(*refs[: len(RayInputs._fields)]), _Inputs(*refs[len(RayInputs._fields) : -2])
+    gain, patches = refs[-2:]
     program = pl.program_id(0)
     patch = program * shape.patch
 
     def one(turn: Array, _: None) -> None:
-        n = program + turn * shape.programs
+        which = program + turn * shape.programs  # of all strips of all hypotheses
+        n = which // shape.strips
 
         @pl.when(n < shape.hypotheses)
         def render_and_score() -> None:
             u0, v0, u1, v1 = (given.rectangle[4 * n + k] for k in range(4))
-            _render(given, shape, n, (u0, v0, u1, v1), patches, patch)
+            tall = (v1 - v0 + shape.strips - 1) // shape.strips
+            first = v0 + (which - n * shape.strips) * tall
+            strip = (u0, first, u1, jnp.minimum(first + tall, v1))
+            _render(rays, shape, n, strip, patches, patch)
             if shape.compiled:  # interpreted, there is one thread
                 triton.debug_barrier()
-            _score(given, shape, n, (u0, v0, u1, v1), patches, patch, gain)
+            _score((rays, given), shape, (n, which), strip, (patches, patch), gain)
             if shape.compiled:
                 triton.debug_barrier()
 
-    jax.lax.fori_loop(0, -(-shape.hypotheses // shape.programs), one, None)
+    jax.lax.fori_loop(0, -(-shape.hypotheses * shape.strips // shape.programs), one, None)
 
 
 def _blocks(area: Array, across: Array) -> tuple[Array, Any]:
     """How many blocks there are in so many pixels; block(k): their number, row and column, and whether they are any."""
 
     def block(k: Array) -> tuple[Array, Array, Array, Array]:
-        index = k * _BLOCK_PIXELS + jax.lax.iota(jnp.int32, _BLOCK_PIXELS)
+        index = k * BLOCK_PIXELS + jax.lax.iota(jnp.int32, BLOCK_PIXELS)
         row = index // jnp.maximum(across, 1)
         return index, row, index - row * across, index < area
 
-    return (area + _BLOCK_PIXELS - 1) // _BLOCK_PIXELS, block
+    return (area + BLOCK_PIXELS - 1) // BLOCK_PIXELS, block
 
 
-def _render(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
+def _render(rays: RayInputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array) -> None:
     """Depth of a hypothesis in its rectangle, and half a window around."""
     half = shape.window // 2
     u0, v0, u1, v1 = rectangle
     wide, tall = u1 - u0 + 2 * half, v1 - v0 + 2 * half
     area = jnp.where((u1 > u0) & (v1 > v0), wide * tall, 0)
     count, block = _blocks(area, wide)
-    fx, fy, cx, cy = (given.numbers[k] for k in range(4))
-    own_rows = given.numbers[7].astype(jnp.int32)
-    normal = [given.plane[4 * n + k] for k in range(3)]
-    offset = given.plane[4 * n + 3]
-
-    def look_up(index: Array, cell: list[Array]) -> tuple[Array, list[Array]]:
-        return triton.load(given.words.at[index]), cell
+    own_rows = rays.camera[4].astype(jnp.int32)
 
     def render(k: Array, _: None) -> None:
         index, row, column, real = block(k)
         u, v = u0 - half + column, v0 - half + row
         inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < own_rows)
-        x, y = (u.astype(jnp.float32) - cx) / fx, (v.astype(jnp.float32) - cy) / fy
-        depth = plane_depth(normal, offset, x, y)
-        for which in range(shape.objects):
-            thing = n * shape.objects + which
-            type_id = given.type[thing]
-            walk, t = enter_grid(
-                given.first[type_id],
-                [given.dims[3 * type_id + a] for a in range(3)],
-                [given.origin[3 * type_id + a] for a in range(3)],
-                given.size[type_id],
-                [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
-                (x, y),
-                NEAREST_HIT,
-            )
-            walk = walk._replace(leave=jnp.where(inside, walk.leave, -NO_SURFACE))
-
-            def unfinished(state: tuple[Array, Array], walk=walk) -> Array:
-                step, t = state
-                return (step < MOST_STEPS) & (jnp.max(on_its_way(t, walk.leave).astype(jnp.int32)) > 0)
-
-            def go(state: tuple[Array, Array], walk=walk) -> tuple[Array, Array]:
-                step, t = state
-                return step + 1, advance(look_up, walk, t, NEAREST_HIT)
-
-            t = jax.lax.while_loop(unfinished, go, (jnp.int32(0), t))[1]
-            depth = jnp.minimum(depth, depth_met(t))
-        triton.store(patches.at[patch + index], jnp.where(inside, depth, NO_SURFACE), mask=real)
+        triton.store(patches.at[patch + index], depth_of_rays(rays, n, shape.objects, u, v, inside), mask=real)
 
     jax.lax.fori_loop(0, count, render, None)
 
 
-def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: Any, patch: Array, gain: Any) -> None:
+def _score(
+    inputs: tuple[RayInputs, _Inputs],
+    shape: _Shape,
+    numbers: tuple[Array, Array],
+    rectangle: tuple,
+    rendered_in: tuple[Any, Array],
+    gain: Any,
+) -> None:
     """What the pixels of the rectangle say, for every sigma and p_outlier."""
+    (rays, given), (n, which), (patches, patch) = inputs, numbers, rendered_in
     half = shape.window // 2
     u0, v0, u1, v1 = rectangle
     wide = u1 - u0
     count, block = _blocks(jnp.where(v1 > v0, wide * (v1 - v0), 0), wide)
-    fx, fy, _, _, outlier_scale, front_margin, weight = (given.numbers[k] for k in range(7))
+    fx, fy = (rays.camera[k] for k in range(2))
+    outlier_scale, front_margin, weight = (given.numbers[k] for k in range(3))
     columns = jax.lax.iota(jnp.int32, shape.p_outliers)
     p = triton.load(given.p_outlier.at[columns])[None]
 
@@ -300,6 +263,6 @@ def _score(given: _Inputs, shape: _Shape, n: Array, rectangle: tuple, patches: A
     def one_sigma(s: Array, _: None) -> None:
         sigma = given.sigma[s]
         total = jax.lax.fori_loop(0, count, partial(look, sigma=sigma), jnp.zeros(shape.p_outliers, jnp.float32))
-        triton.store(gain.at[(n * shape.sigmas + s) * shape.p_outliers + columns], weight * total)
+        triton.store(gain.at[(which * shape.sigmas + s) * shape.p_outliers + columns], weight * total)
 
     jax.lax.fori_loop(0, shape.sigmas, one_sigma, None)
