@@ -25,6 +25,13 @@ def enable_cache() -> Path:
     return folder
 
 
+def compute_likelihood(name: str) -> None:
+    """Compute on the CPU where `likelihood: name` has a kernel for CPUs alone, even if JAX finds a GPU, unless the user
+    chose ($JAX_PLATFORMS). Once something has been computed it is too late."""
+    if name == "depth" and not os.environ.get("JAX_PLATFORMS"):
+        jax.config.update("jax_platforms", "cpu")
+
+
 def every_core() -> None:
     """Make each core of a CPU one of JAX's devices, over which what XLA itself computes can be shared out (calls of the
     compiled loops are shared by XLA's threads in any case). Once something has been computed it is too late, and a

@@ -20,6 +20,7 @@ Settings = TypeVar("Settings")
 FOLDER = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 ANY = click.Path(path_type=Path)
+_DEVICE = "bayes3d_ros.device"  # what --device said
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
 
@@ -28,9 +29,9 @@ def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option(
         "--device",
         type=click.Choice(["cpu", "gpu"]),
-        callback=lambda ctx, parameter, value: _choose_device(value),
+        callback=_choose_device,
         expose_value=False,
-        help="Where to compute; default: a GPU where JAX finds one.",
+        help="Where to compute; default: a GPU where JAX finds one, the CPU for likelihood depth.",
     )(command)
 
 
@@ -63,8 +64,17 @@ def replace_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--replace", is_flag=True, help=told)(command)
 
 
-def _choose_device(device: str | None) -> None:
+def compute_unless_chosen(likelihood: str) -> None:
+    """Compute where this likelihood can be computed, unless --device says where."""
+    from bayes3d_ros.jax_runtime import compute_likelihood
+
+    if click.get_current_context().meta.get(_DEVICE) is None:
+        compute_likelihood(likelihood)
+
+
+def _choose_device(ctx: click.Context, parameter: click.Parameter, device: str | None) -> None:
     """Before jax is imported. Does not take most of a GPU's memory from the other programs of a robot."""
+    ctx.meta[_DEVICE] = device
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if device == "cpu":
         os.environ["JAX_PLATFORMS"] = "cpu"

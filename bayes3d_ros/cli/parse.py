@@ -13,6 +13,7 @@ from bayes3d_ros.cli.options import (
     FOLDER,
     CommandWithSettings,
     check_type_names,
+    compute_unless_chosen,
     device_option,
     names_in,
     seed_option,
@@ -112,6 +113,7 @@ def parse(
 
     writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)
+    compute_unless_chosen(settings.likelihood)
     models = load_library(library)
     check_type_names(settings.types, models)
     frames = read_frames(bag, topic, table_frame, every)

@@ -73,8 +73,7 @@ def track(
     from bayes3d_ros.io.tracking_results import PICTURE_FILE, TrackWriter
     from bayes3d_ros.jax_runtime import enable_cache, every_core
     from bayes3d_ros.objects.store import load_library
-    from bayes3d_ros.parsing.parser import SceneParser
-    from bayes3d_ros.tracking.session import CameraFollower
+    from bayes3d_ros.tracking.session import CameraFollower, parser_of_worlds
     from bayes3d_ros.tracking.tracker import CameraTracker
     from bayes3d_ros.tracking.world_file import load_world
 
@@ -86,7 +85,7 @@ def track(
     enable_cache()
     every_core()
     told = None if world is None else load_world(world, settings.table, models)
-    follower = CameraFollower(CameraTracker(models, settings), SceneParser(models), told)
+    follower = CameraFollower(CameraTracker(models, settings), parser_of_worlds(models), told)
     around = "what its first frame shows" if told is None else ", ".join(told.types)
     click.echo(f"following the camera around {around}")
     recording = writers.TrackRecording(mcap, table_frame) if writers else NoRecording()

@@ -52,9 +52,19 @@ def kernel(image: ScoredImage) -> Gain | None:
     return None
 
 
+def has_shared_kernel() -> bool:
+    """Whether errors that pixels share (`likelihood: depth`) can be computed where JAX computes: on CPUs they can."""
+    return jax.default_backend() == "cpu" and readable()
+
+
+def likelihood_here() -> str:
+    """The value of the setting `likelihood` to take where nobody chose: its default where JAX can compute it."""
+    return "depth" if has_shared_kernel() else "independent"
+
+
 def shared_kernel() -> Callable[..., tuple[Array, Array]]:
     """The kernel of errors that pixels share. Raises RuntimeError where this machine has none: only CPUs do."""
-    if jax.default_backend() != "cpu" or not readable():
+    if not has_shared_kernel():
         raise RuntimeError(
             f"likelihood: depth is computed on CPUs alone, and JAX computes on {jax.default_backend()}: expected "
             "JAX_PLATFORMS=cpu or likelihood: independent"

@@ -19,7 +19,6 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.jax_runtime import every_core
 from bayes3d_ros.objects.model import Library, LibraryError
-from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.camera_path import CameraPath
@@ -32,7 +31,7 @@ from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.to_messages import camera_particles, camera_pose_message
 from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
-from bayes3d_ros.tracking.session import CameraFollower
+from bayes3d_ros.tracking.session import CameraFollower, parser_of_worlds
 from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
 from bayes3d_ros.tracking.world_file import load_world
 
@@ -58,7 +57,7 @@ class _Session(NamedTuple):
 
 def make_follower(library: Library, settings: TrackerSettings, world: KnownWorld | None) -> Follower:
     """A tracker for the objects of a library, and a parser for its first frame, or a world that is known."""
-    return CameraFollower(CameraTracker(library, settings), SceneParser(library), world)
+    return CameraFollower(CameraTracker(library, settings), parser_of_worlds(library), world)
 
 
 class CameraTrackerNode(Node):

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import jax
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.jax_runtime import compute_likelihood
 from bayes3d_ros.objects.model import Library, type_names
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.markers import SceneMarkers
@@ -52,7 +53,8 @@ def make_bundle(
     make_parser: MakeParser, library: Library, settings: ParserSettings, size: tuple[int, int], capacity: int
 ) -> ParserBundle:
     """Compile for images of a size (width, height; none if one is 0) and scenes of up to `capacity` objects. Takes
-    seconds to minutes."""
+    seconds to minutes. The process computes on the CPU from then on where the likelihood needs one."""
+    compute_likelihood(settings.likelihood)
     parser = make_parser(library, settings, capacity)
     if all(size):
         parser.warm_up(*size)

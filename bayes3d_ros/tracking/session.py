@@ -9,10 +9,18 @@ from jaxtyping import Float
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.poses import pose_matrix
+from bayes3d_ros.likelihood.backends import likelihood_here
+from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
+from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError
 from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
+
+
+def parser_of_worlds(library: Library) -> SceneParser:
+    """The parser that finds the world in a first frame, and a camera that is lost."""
+    return SceneParser(library, ParserSettings(likelihood=likelihood_here()))
 
 
 class CameraFollower:

@@ -67,9 +67,12 @@ def parsers(monkeypatch, fake_posterior):
             return fake_posterior(frame, self.models.names)
 
     monkeypatch.setattr(parser, "SceneParser", Parser)
-    compilation = SimpleNamespace(enable_cache=lambda: None, every_core=lambda: None)
+    computed = []  # the likelihoods that the machine was chosen for
+    compilation = SimpleNamespace(
+        enable_cache=lambda: None, every_core=lambda: None, compute_likelihood=computed.append
+    )
     monkeypatch.setitem(sys.modules, "bayes3d_ros.jax_runtime", compilation)
-    return SimpleNamespace(made=made, failing=Parser.failing)
+    return SimpleNamespace(made=made, failing=Parser.failing, computed=computed)
 
 
 def run(*arguments):
@@ -312,7 +315,14 @@ def test_device_cpu_is_chosen_before_jax(bag, library, parsers, tmp_path, monkey
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     arguments = ("--library", library, "--out", tmp_path / "out", "--device", "cpu")
     assert run("parse", bag, *arguments).exit_code == 0
-    assert os.environ["JAX_PLATFORMS"] == "cpu"
+    assert os.environ["JAX_PLATFORMS"] == "cpu" and parsers.computed == []
+
+
+def test_without_a_device_the_likelihood_chooses(bag, library, parsers, tmp_path):
+    arguments = ("--library", library, "--out", tmp_path / "out", "--set", "likelihood=independent")
+    assert run("parse", bag, *arguments).exit_code == 0
+    assert run("parse", bag, *arguments[:-2]).exit_code == 0
+    assert parsers.computed == ["independent", "depth"]
 
 
 def test_an_interrupt_is_one_line_and_keeps_what_was_finished(bag, library, parsers, tmp_path, monkeypatch):

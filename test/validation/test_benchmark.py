@@ -18,7 +18,7 @@ def calls(monkeypatch, fake_posterior):
     made = []
 
     class Parser:
-        def __init__(self, library):
+        def __init__(self, library, settings):
             self.names = library.names
 
         def warm_up(self, width, height):

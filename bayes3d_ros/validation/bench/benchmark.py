@@ -22,11 +22,13 @@ import bayes3d_ros
 from bayes3d_ros.geometry.mesh import MeshError
 from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.jax_runtime import cores, enable_cache
+from bayes3d_ros.likelihood.backends import likelihood_here
 from bayes3d_ros.objects.mesh_import import DEFAULT_VOXEL_SIZE, import_meshes
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.speed_rows import FILLED_TABLE, SpeedRow, speed_row
 from bayes3d_ros.validation.simulate.simulation import simulate
 
@@ -135,7 +137,7 @@ def ycb_mesh(name: str) -> Path:
 def parse_rows(cases: Sequence[Case], library: Library) -> list[SpeedRow]:
     """Time per frame with everything compiled: a bag's frames in turn, at least REPEATS of them. Bags take turns, as
     machines have moods."""
-    parser = SceneParser(library)
+    parser = _parser(library)
     frames = [list(read_frames(case.bag)) for case in cases]
     sizes = [(of_bag[0].intrinsics.width, of_bag[0].intrinsics.height) for of_bag in frames]
     for size in dict.fromkeys(sizes):
@@ -156,6 +158,10 @@ def parse_rows(cases: Sequence[Case], library: Library) -> list[SpeedRow]:
     ]
 
 
+def _parser(library: Library) -> SceneParser:
+    return SceneParser(library, ParserSettings(likelihood=likelihood_here()))
+
+
 def start_row(what: str, case: Case, library: Path, cache: Path) -> SpeedRow:
     """From starting a process to its first result, imports and compilation included, with this compilation cache."""
     camera = next(iter(read_frames(case.bag))).intrinsics
@@ -171,7 +177,7 @@ def first_result(bag: str, library: str) -> None:
     """What `start_row` times, in its own process."""
     enable_cache()
     frame = next(iter(read_frames(Path(bag))))
-    SceneParser(load_library(Path(library))).parse(frame)
+    _parser(load_library(Path(library))).parse(frame)
 
 
 def memory_row(case: Case, library: Path) -> SpeedRow:
@@ -187,7 +193,7 @@ def memory(bag: str, library: str) -> None:
     """What `memory_row` measures, in its own process: says it as JSON."""
     enable_cache()
     frames = list(read_frames(Path(bag)))
-    parser = SceneParser(load_library(Path(library)))
+    parser = _parser(load_library(Path(library)))
     seconds, peaks = [], []
     for k in range(MEMORY_FRAMES[1]):
         start = time.perf_counter()
