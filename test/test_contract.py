@@ -154,7 +154,7 @@ def test_bench_writes_rows_beside_the_machine_and_the_versions(tmp_path: Path, m
     latency = pytest.importorskip("bayes3d_ros.ros.latency")
 
     class Parser:
-        def __init__(self, library) -> None:
+        def __init__(self, library, settings) -> None:
             self.names = library.names
 
         def warm_up(self, width: int, height: int) -> None:

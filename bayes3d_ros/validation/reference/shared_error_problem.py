@@ -221,28 +221,34 @@ _sample_noise = jax.jit(sample_noise)
 def run_shared_sampler(
     key: PRNGKeyArray, image: ScoredImage, model: SharedErrors, problem: SharedProblem
 ) -> SharedPosterior:
-    """The posterior given an image of numpy arrays: every stage of the sampler, of weight P(n) Z_n."""
+    """The posterior given an image of numpy arrays: every stage of the sampler, of weight P(n) Z_n. As `SceneParser`
+    does, it goes on from stages whose objects were not moved again, and moves those of the likeliest stage."""
     settings = problem.settings
     context = Context(jax.device_put(image), problem.library, problem.table)
     size = settings.table_width, settings.table_depth
     effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
+    given = (context, model, size, settings.window, settings.ess_threshold)
     state = smc.init(context, model, settings.particles, settings.max_objects, size, settings.window)
-    stages, ess, log_mass, log_weights = [], [], [], []
-    margin = np.asarray(model.image.table_margin, np.float64)
-    for number in range(settings.max_objects + 1):
-        if number:
-            count, given = jnp.int32(number - 1), (context, model, size, settings.window, settings.ess_threshold)
-            state, info = smc.step(jax.random.fold_in(key, number), state, count, *given)
-            ess.append(float(info.ess))
+    states, ess, log_weights = [state], [], [float(state.log_evidence) + problem.log_count[0]]
+    for number in range(1, settings.max_objects + 1):
+        state, info = smc.step(jax.random.fold_in(key, number), state, jnp.int32(number - 1), *given)
+        ess.append(float(info.ess))
+        states.append(state)
         log_weights.append(float(state.log_evidence) + problem.log_count[number])
-        if number >= fewest_moved(settings.tempering_steps) and log_weights[-1] > max(log_weights) - NEGLIGIBLE:
-            again = (context, model, settings.window, settings.ess_threshold, effort)
-            state = smc.refresh(jax.random.fold_in(key, 2000 + number), state, jnp.int32(number), *again)
-        stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weights[-1]))
         if log_weights[-1] < max(log_weights) - NEGLIGIBLE:
-            log_mass.append(np.full(settings.particles, np.inf))  # no weight is left of them
             break
-        log_mass.append(log_masses(stages[-1].objects, stages[-1].number, margin, problem))
+    best = int(np.argmax(log_weights))
+    if best >= fewest_moved(settings.tempering_steps):  # of the likeliest stage alone, once the sampler has gone on
+        again = (context, model, settings.window, settings.ess_threshold, effort)
+        moved_key = jax.random.fold_in(key, 2000 + best)
+        states[best] = smc.refresh(moved_key, states[best], jnp.int32(best), *again)
+    stages, log_mass = [], []
+    margin = np.asarray(model.image.table_margin, np.float64)
+    for number, (state, log_weight) in enumerate(zip(states, log_weights, strict=True)):
+        stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weight))
+        negligible = log_weight < max(log_weights) - NEGLIGIBLE  # no weight is left of them
+        none = np.full(settings.particles, np.inf)
+        log_mass.append(none if negligible else log_masses(stages[-1].objects, stages[-1].number, margin, problem))
     mixture: Samples = jax.tree.map(lambda *parts: np.concatenate(parts), *stages)
     weight = np.exp(mixture.weight.astype(float) - mixture.weight.max())
     return SharedPosterior(mixture._replace(weight=weight / weight.sum(), ess=tuple(ess)), np.concatenate(log_mass))
