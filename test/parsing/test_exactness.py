@@ -76,9 +76,9 @@ def enumerated(problem, levels=LEVELS):
     return found.log_evidence[-1], found.marginals(problem)
 
 
-def sampled(problem, step):
+def sampled(problem, step, seeds=SEEDS):
     """log Z_hat of every seed, and the marginals of all, weighted by Z_hat."""
-    runs = [run(problem, seed, PARTICLES, step) for seed in range(SEEDS)]
+    runs = [run(problem, seed, PARTICLES, step) for seed in range(seeds)]
     log_z = [r.log_evidence[-1] for r in runs]
     each = [run_marginals(problem, r) for r in runs]
     weight = evidence_weights(log_z)
@@ -155,14 +155,14 @@ def test_pixels_that_count_in_part(seen, step):
 
 def test_a_hidden_handle(hidden, hidden_exact, step):
     """The posterior covers the arc that hides the handle."""
-    log_z, mixed = sampled(hidden, step())
+    log_z, mixed = sampled(hidden, step(), 96)
     log_truth, truth = hidden_exact
     assert agrees(log_z, log_truth)
     yaw, true = binned("yaw", mixed["yaw"]), binned("yaw", truth.yaw)
     assert total_variation(yaw, true) < 0.1
     arc = true > 0.02
     assert arc.sum() >= 6 and spread(true) > np.radians(12)
-    assert spread(yaw) == pytest.approx(spread(true), rel=0.03)  # measured: 0.010
+    assert spread(yaw) == pytest.approx(spread(true), rel=0.03)  # measured: 0.001; with 12 seeds -0.04 to 0.09
     assert (yaw[arc] > true[arc] / 3).all()
 
 
