@@ -35,36 +35,35 @@ class Gain(Protocol):
     ) -> Float[Array, "N S P"]: ...
 
 
+def has_loops() -> bool:
+    """Whether the compiled loops of `cpu/` run where JAX computes: all of `likelihood: depth` needs them."""
+    return jax.default_backend() == "cpu" and readable()
+
+
 def kernel(image: ScoredImage) -> Gain | None:
     """The kernel that scores hypotheses of this image where JAX computes by default; None where they are scored tile by
     tile (`tiles.py`): free points, other backends, a CPU whose call frames the kernel cannot read."""
     if image.likelihood.name != "independent" or image.points is not None:
         return None
-    backend = jax.default_backend()
-    if backend == "cpu" and readable():
+    if has_loops():
         from bayes3d_ros.likelihood.cpu.gain import compiled_gain  # either takes a while to import
 
         return compiled_gain
-    if backend == "gpu":
+    if jax.default_backend() == "gpu":
         from bayes3d_ros.likelihood.gpu.triton_gain import triton_gain
 
         return triton_gain
     return None
 
 
-def has_shared_kernel() -> bool:
-    """Whether errors that pixels share (`likelihood: depth`) can be computed where JAX computes: on CPUs they can."""
-    return jax.default_backend() == "cpu" and readable()
-
-
 def likelihood_here() -> str:
     """The value of the setting `likelihood` to take where nobody chose: its default where JAX can compute it."""
-    return "depth" if has_shared_kernel() else "independent"
+    return "depth" if has_loops() else "independent"
 
 
 def shared_kernel() -> Callable[..., tuple[Array, Array]]:
     """The kernel of errors that pixels share. Raises RuntimeError where this machine has none: only CPUs do."""
-    if not has_shared_kernel():
+    if not has_loops():
         raise RuntimeError(
             f"likelihood: depth is computed on CPUs alone, and JAX computes on {jax.default_backend()}: expected "
             "JAX_PLATFORMS=cpu or likelihood: independent"
@@ -77,12 +76,11 @@ def shared_kernel() -> Callable[..., tuple[Array, Array]]:
 def depth_kernel() -> Callable[..., Array] | None:
     """The kernel that draws depth images where JAX computes by default; None where there is none: the walk of
     `march.py` does as well."""
-    backend = jax.default_backend()
-    if backend == "cpu" and readable():
+    if has_loops():
         from bayes3d_ros.likelihood.cpu.gain import compiled_depth
 
         return compiled_depth
-    if backend == "gpu":
+    if jax.default_backend() == "gpu":
         from bayes3d_ros.likelihood.gpu.triton_depth import triton_depth
 
         return triton_depth

@@ -17,7 +17,7 @@ def gpu(monkeypatch):
 
 
 def test_errors_that_pixels_share_have_no_kernel_on_a_gpu(gpu):
-    assert not backends.has_shared_kernel() and backends.likelihood_here() == "independent"
+    assert not backends.has_loops() and backends.likelihood_here() == "independent"
     assert backends.depth_kernel() is triton_depth
     with pytest.raises(RuntimeError, match=r"JAX computes on gpu: expected JAX_PLATFORMS=cpu or likelihood: indep"):
         backends.shared_kernel()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The CPU's kernel, beyond what test_camera_score.py and test_scene_score.py compare with whole images."""
+"""The CPU's kernel, beyond what test_camera_score.py and test_scene_score.py compare with whole images; and the depth
+images of the GPU's."""
 
 import jax
 import jax.numpy as jnp

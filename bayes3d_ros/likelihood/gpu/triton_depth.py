@@ -64,9 +64,7 @@ def _kernel(
     real = index < pixels
     row = index // width
     u, v = index - row * width - border, row - border
-    own_rows = given.camera[4].astype(jnp.int32)
-    inside = real & (u >= 0) & (u < camera_width) & (v >= 0) & (v < own_rows)
-    met = depth_of_rays(given, n, objects, u, v, inside)
+    met = depth_of_rays(given, n, objects, camera_width, u, v, real)
     place = n * pixels + index
     if some:
         met = jnp.minimum(met, triton.load(start.at[place], mask=real, other=NO_SURFACE))

@@ -190,13 +190,12 @@ def _render(rays: RayInputs, shape: _Shape, n: Array, rectangle: tuple, patches:
     wide, tall = u1 - u0 + 2 * half, v1 - v0 + 2 * half
     area = jnp.where((u1 > u0) & (v1 > v0), wide * tall, 0)
     count, block = _blocks(area, wide)
-    own_rows = rays.camera[4].astype(jnp.int32)
 
     def render(k: Array, _: None) -> None:
         index, row, column, real = block(k)
         u, v = u0 - half + column, v0 - half + row
-        inside = real & (u >= 0) & (u < shape.width) & (v >= 0) & (v < own_rows)
-        triton.store(patches.at[patch + index], depth_of_rays(rays, n, shape.objects, u, v, inside), mask=real)
+        depth = depth_of_rays(rays, n, shape.objects, shape.width, u, v, real)
+        triton.store(patches.at[patch + index], depth, mask=real)
 
     jax.lax.fori_loop(0, count, render, None)
 

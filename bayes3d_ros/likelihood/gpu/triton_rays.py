@@ -60,11 +60,12 @@ def ray_inputs(hypotheses: RenderedHypotheses, image: ScoredImage, library: Libr
 
 
 def depth_of_rays(
-    given: RayInputs, n: Array, objects: int, u: Array, v: Array, inside: Bool[Array, "B"]
+    given: RayInputs, n: Array, objects: int, width: int, u: Array, v: Array, real: Bool[Array, "B"]
 ) -> Float[Array, "B"]:
-    """Depth of what hypothesis `n` adds, in a block of pixels of the camera; NO_SURFACE where nothing is met and where
-    `inside` does not hold."""
+    """Depth of what hypothesis `n` adds, in a block of pixels; NO_SURFACE where nothing is met, outside of the camera's
+    image, which is `width` wide, and where `real` does not hold."""
     fx, fy, cx, cy = (given.camera[k] for k in range(4))
+    inside = real & (u >= 0) & (u < width) & (v >= 0) & (v < given.camera[4].astype(jnp.int32))
     x, y = (u.astype(jnp.float32) - cx) / fx, (v.astype(jnp.float32) - cy) / fy
     depth = plane_depth([given.plane[4 * n + k] for k in range(3)], given.plane[4 * n + 3], x, y)
 
