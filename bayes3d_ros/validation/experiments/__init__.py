@@ -21,6 +21,7 @@ EXPERIMENTS: dict[str, str] = {
     "calibration-shared-known-noise": "bayes3d_ros.validation.experiments.calibration_shared_known_noise",
     "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",
     "coverage": "bayes3d_ros.validation.experiments.coverage",
+    "coverage-tables": "bayes3d_ros.validation.experiments.coverage_tables",
     "dial": "bayes3d_ros.validation.experiments.dial",
     "exactness": "bayes3d_ros.validation.experiments.exactness",
     "learning": "bayes3d_ros.validation.experiments.learning",

@@ -7,9 +7,10 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.objects.model import Library, ObjectModel
@@ -130,11 +131,24 @@ def scene_row(k: int, label: str, scene: RandomScene, parser: SceneParser) -> Ro
     return row | object_row(scene, posterior, parser.library.models[0])
 
 
-def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel) -> Row:
-    """Credible regions of the estimate nearest to the object; nothing if there is none near it.
+class SampledObject(NamedTuple):
+    """What S samples say of one object, against the truth, on the table's axes. Metres, radians.
 
     Position is that of the centre of the object's box: the origin of a mesh's frame may lie beside it.
     """
+
+    sample: Int[np.ndarray, "S"]  # which sample of the posterior
+    type: Int[np.ndarray, "S"]  # of the posterior's types
+    weight: Float[np.ndarray, "S"]  # normalised
+    total: float  # of their weights in the posterior: the probability that the object is there
+    off: Float[np.ndarray, "S 2"]  # from the true x and y
+    yaw: Float[np.ndarray, "S"]  # from the true one, symmetries taken out
+    tilt: Float[np.ndarray, "S"]  # from the true contact face
+    view: Float[np.ndarray, "2"]  # the direction in which the camera sees it, of unit length
+
+
+def sampled_object(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel) -> SampledObject | None:
+    """The estimate nearest to the scene's object; None if there is none near it."""
     T_table_camera = scene.frame.T_table_camera
     assert T_table_camera is not None
     samples = posterior.samples
@@ -146,7 +160,7 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
         here = Rotation.from_quat(estimate.orientation).apply(centre) + estimate.position
         near.append((float(np.linalg.norm(to_table @ here + camera - true)), j))
     if not near or min(near)[0] > SAME_THING_WITHIN:
-        return {}
+        return None
     sample, slot = np.nonzero(posterior.object_index == min(near)[1])
     weights = samples.weight[sample]
     total = weights.sum()
@@ -156,6 +170,15 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
     off = (placed - true)[:, :2]
     yaw, tilt = yaw_and_tilt(relative_turns(model, scene.T_table_object[:3, :3], turned))
     view = (true - camera)[:2] / np.linalg.norm((true - camera)[:2])
+    return SampledObject(sample, samples.type[sample, slot], weights, float(total), off, yaw, tilt, view)
+
+
+def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel) -> Row:
+    """Credible regions of the estimate nearest to the object; nothing if there is none near it."""
+    told = sampled_object(scene, posterior, model)
+    if told is None:
+        return {}
+    _, _, weights, total, off, yaw, tilt, view = told
     found: dict[str, Credible] = {
         "x": central_interval(off[:, 0], weights, 0.0),
         "y": central_interval(off[:, 1], weights, 0.0),
@@ -167,7 +190,7 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
         found["yaw"] = angle_interval(yaw, weights)
         found["pose"] = ellipsoid(np.column_stack([off, yaw]), weights)
     return {
-        "probability": round(float(total), 6),
+        "probability": round(total, 6),
         "samples_ess": round(float(1 / (weights**2).sum()), 2),
         "right_rest": round(float(weights[tilt < RIGHT_REST_WITHIN].sum()), 5),
         **{name: {key: round(v, 8) for key, v in said._asdict().items()} for name, said in found.items()},

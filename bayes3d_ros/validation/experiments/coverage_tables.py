@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Do credible regions hold the truth on tables of two objects, with ten types in the library, for errors from half to
+three times as large as the settings are for? Where each object stands, and where they stand relative to each other.
+
+The generator's errors have other forms than the likelihood's (`validation/simulate/shared_error_frames.py`)."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bayes3d_ros.io.palette import colour
+from bayes3d_ros.objects.model import ObjectModel
+from bayes3d_ros.posterior.types import ParseError, ScenePosterior
+from bayes3d_ros.validation.experiments import Row, Step
+from bayes3d_ros.validation.experiments.coverage import (
+    COVERED_TYPES,
+    SampledObject,
+    object_row,
+    quantity,
+    sampled_object,
+)
+from bayes3d_ros.validation.experiments.open_world import YcbWorld, ycb_world
+from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
+from bayes3d_ros.validation.simulate.mixed_tables import RandomTable, random_table
+from bayes3d_ros.validation.simulate.random_scenes import RandomScene
+from bayes3d_ros.validation.simulate.ray_casting import SimulationError
+from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise
+from bayes3d_ros.validation.statistics.credible_regions import angle_interval, central_interval, ellipsoid
+from bayes3d_ros.validation.statistics.symmetries import SYMMETRIES
+
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
+
+# Size of the errors, of those that the settings are for -> the least and the largest share of truths in 90 % regions.
+LIMITS = {0.5: (0.86, 0.94), 1.0: (0.86, 0.94), 2.0: (0.86, 0.94), 3.0: (0.8, 1.0)}
+AMPLITUDES = tuple(LIMITS)
+MOST_WIDE = 4.0  # RMS errors: of a 90 % region
+TABLES, QUICK_TABLES = 100, 5  # for each amplitude
+FULL_SEED, QUICK_SEED = 600_000, 690_000
+OBJECTS = 2
+_CHOICES = 20  # of types and places before a table is given up
+OWN = ("x", "y", "range", "across", "yaw", "position")
+RELATIVE = ("apart_x", "apart_y", "apart_yaw", "apart")  # of the two objects
+QUANTITIES = OWN + RELATIVE
+WANTED = {
+    f"x {amplitude:g}: {name}.{key}": limit
+    for amplitude, (low, high) in LIMITS.items()
+    for name in QUANTITIES
+    for key, limit in (("coverage_90", f"{low:g} to {high:g}"), ("width_per_error", f"at most {MOST_WIDE:g}"))
+}
+HEADER = f"{'table':>6} {'x':>4} {'objects':<44} {'error mm':>14} {'level':>10} {'apart mm':>9} {'level':>6} {'s':>5}"
+
+
+def notes(quick: bool) -> list[str]:
+    """What the figures are of."""
+    return ["an object of another name, or farther off than 10 cm, is not found and counts as not covered"]
+
+
+def count(quick: bool) -> int:
+    """How many tables there are."""
+    return len(AMPLITUDES) * (QUICK_TABLES if quick else TABLES)
+
+
+def steps(quick: bool) -> Iterator[Step]:
+    """The rows of a table: one an object, and one for the pair. A table is the same at all amplitudes but for its
+    errors' size."""
+    world = ycb_world()
+    for k in range(QUICK_TABLES if quick else TABLES):
+        for amplitude in AMPLITUDES:
+            yield partial(table_rows, k + (QUICK_SEED if quick else FULL_SEED), amplitude, world)
+
+
+def table_rows(seed: int, amplitude: float, world: YcbWorld) -> list[Row]:
+    """Make a table, parse it, and hold what is said of both objects against the truth."""
+    row: Row = {"table": seed, "amplitude": amplitude, "objects": None, "seconds": None, "error": None}
+    row |= dict.fromkeys(QUANTITIES)
+    try:
+        table = _table(seed, amplitude, world)
+        posterior = world.parser().parse(table.frame)
+    except (SimulationError, ParseError) as error:
+        return [row | {"error": str(error)}]
+    scenes = [_alone(table, k) for k in range(OBJECTS)]
+    models = [world.models[scene.name] for scene in scenes]
+    row |= {"objects": [scene.name for scene in scenes], "seconds": round(posterior.seconds, 3)}
+    own = []
+    for scene, model in zip(scenes, models, strict=True):
+        told = object_row(scene, posterior, model) if _named(scene, posterior, model, world) else {}
+        own.append(row | {"objects": [scene.name]} | {name: told.get(name) for name in OWN})
+    return [*own, row | (_relative(scenes, models, posterior) if all(r["position"] for r in own) else {})]
+
+
+def _table(seed: int, amplitude: float, world: YcbWorld) -> RandomTable:
+    """Two of the types whose symmetries are known; of the choices, the first one that can be made."""
+    rng, problem = np.random.default_rng([seed, 17]), SimulationError("expected a table that can be made")
+    for trial in range(_CHOICES):
+        names = rng.choice(COVERED_TYPES, OBJECTS, False)
+        try:
+            return random_table([world.known(str(name)) for name in names], amplitude, seed + 1_000_000 * trial)
+        except SimulationError as error:
+            problem = error
+    raise problem
+
+
+def _alone(table: RandomTable, k: int) -> RandomScene:
+    """One object of a table. Its pose is in the table's frame as the camera's given pose has it: what the camera sees
+    is true, and the given pose is a little wrong."""
+    thing, T_table_object = table.objects[k]
+    given = table.frame.T_table_camera
+    assert given is not None
+    T = given @ np.linalg.inv(table.T_table_camera) @ T_table_object
+    return RandomScene(thing.name, 0, table.frame, T, SensorNoise())
+
+
+def _named(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel, world: YcbWorld) -> bool:
+    """Whether most samples of the nearest estimate are of the object's own type."""
+    told = sampled_object(scene, posterior, model)
+    if told is None:
+        return False
+    own = world.library.names.index(scene.name)
+    return float(told.weight[told.type == own].sum()) > 0.5
+
+
+def _relative(scenes: Sequence[RandomScene], models: Sequence[ObjectModel], posterior: ScenePosterior) -> Row:
+    """Regions of the second object's pose relative to the first one's, of the samples that hold both."""
+    one, other = (sampled_object(scene, posterior, model) for scene, model in zip(scenes, models, strict=True))
+    assert one is not None and other is not None
+    off, yaw, weight = _differences(one, other)
+    if not len(weight):
+        return {}
+    said = {
+        "apart_x": central_interval(off[:, 0], weight, 0.0),
+        "apart_y": central_interval(off[:, 1], weight, 0.0),
+        "apart": ellipsoid(off, weight),
+    }
+    if all(SYMMETRIES[scene.name].has_yaw for scene in scenes):
+        said["apart_yaw"] = angle_interval(yaw, weight)
+    return {name: {key: round(v, 8) for key, v in region._asdict().items()} for name, region in said.items()}
+
+
+def _differences(one: SampledObject, other: SampledObject):
+    """Second object less first, of the samples that hold both: x and y [S, 2], yaw [S], weights [S]."""
+    _, first, second = np.intersect1d(one.sample, other.sample, return_indices=True)
+    weight = one.weight[first]
+    total = weight.sum()
+    weight = weight / total if total > 0 else weight[:0]
+    return other.off[second] - one.off[first], other.yaw[second] - one.yaw[first], weight
+
+
+def line(row: Row) -> str:
+    """A row, under HEADER."""
+    start = f"{row['table']:>6} {row['amplitude']:>4g} "
+    if row["error"]:
+        return f"{start}{row['error']}"
+    words = [start, f"{', '.join(row['objects']):<44} "]
+    for said, width in ((row["position"], 14), (row["apart"], 9)):
+        numbers = f"{1e3 * said['error']:>{width}.2f} {said['level']:>6.2f}" if said else f"{'-':>{width}} {'':>6}"
+        words.append(f"{numbers} ")
+    return f"{''.join(words)} {row['seconds']:>5.2f}"
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """For each amplitude and quantity what `coverage` tells of a noise model and quantity; and what is not met."""
+    told: dict[str, Any] = {}
+    for amplitude in AMPLITUDES:
+        every = [row for row in rows if row["amplitude"] == amplitude and not row["error"]]
+        for name in QUANTITIES:
+            able = [row for row in every if (len(row["objects"]) > 1) == (name in RELATIVE) and _can_have(row, name)]
+            if able:
+                told[f"x {amplitude:g}: {name}"] = quantity(name, able)
+    told["errors"] = sum(bool(row["error"]) for row in rows)
+    told["not_met"] = [
+        key
+        for amplitude, limits in LIMITS.items()
+        for name in QUANTITIES
+        if (key := f"x {amplitude:g}: {name}") in told and not _met(told[key], limits)
+    ]
+    return told
+
+
+def _can_have(row: Row, name: str) -> bool:
+    """A can has no yaw."""
+    return "yaw" not in name or all(SYMMETRIES[each].has_yaw for each in row["objects"])
+
+
+def _met(value: Row, limits: tuple[float, float]) -> bool:
+    narrow = value["width_per_error"] is None or value["width_per_error"] <= MOST_WIDE
+    return limits[0] <= value["coverage_90"] <= limits[1] and narrow
+
+
+def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write coverage-tables.png: coverage of 90 % regions against the errors' size."""
+    figure = Figure(figsize=(7.5, 4.6), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    axis.axhspan(0.86, 0.94, color=GREY, alpha=0.2, linewidth=0, label="wanted up to x 2")
+    axis.axhline(0.8, color=GREY, linewidth=1, linestyle=":", label="wanted at x 3")
+    told = summary(rows)
+    for k, name in enumerate(QUANTITIES):
+        there = [(a, told[key]["coverage_90"]) for a in AMPLITUDES if (key := f"x {a:g}: {name}") in told]
+        style = "--" if name in RELATIVE else "-"
+        axis.plot(
+            [a for a, _ in there], [share for _, share in there], style, marker="o", color=colour(k + 1), label=name
+        )
+    axis.set(ylim=(0, 1))
+    open_frame(axis)
+    label_plot(axis, "size of the errors, of those that the settings are for", "truth within the 90 % region", "")
+    axis.legend(fontsize=8, frameon=False, loc="lower left", ncols=3)
+    path = folder / "coverage-tables.png"
+    figure.savefig(path, dpi=110)
+    return [path]
