@@ -5,8 +5,7 @@
 Every view votes on every voxel: for a surface where points fall into it, for free space where rays pass through to
 something behind it; what a view's rays do not reach it says nothing of. Votes are log odds, so that flying pixels of
 one view, or one view whose pose is wrong, lose against the others. Planes are then fitted to the points of the voxels
-that won. Voxels that nobody saw count as solid inside the convex hull of the surface, and are known to be unseen. With
-one view it is the hull of the surface and of its half turn (`half_turn.py`).
+that won. Voxels that nobody saw count as solid inside the convex hull of the surface, and are known to be unseen.
 """
 
 from collections.abc import Sequence
@@ -22,7 +21,6 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
 from bayes3d_ros.learning.fusion_constants import BEHIND_VOXEL, FEWEST_VOXELS, FOOT, GLIMPSE, HIT, LOW, PASS, THIN
-from bayes3d_ros.learning.half_turn import half_turned
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.tuning import TUNING
 
@@ -50,7 +48,7 @@ class Fused(NamedTuple):
 
     solid: VoxelSolid
     views: Int[np.ndarray, "S"]  # how many views saw each surface voxel; 0 where it was never seen but must be
-    hull: Float[np.ndarray, "H 3"]  # corners of its convex hull, what is guessed included
+    hull: Float[np.ndarray, "H 3"]  # corners of its convex hull
 
 
 class FusionError(Exception):
@@ -67,8 +65,7 @@ class Seen(NamedTuple):
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
-    guessed = half_turned(views[0].surface.points, *views[0][1:]) if len(views) == 1 else np.zeros((0, 3))
-    grid = _grid([*(view.surface.points for view in views), guessed], voxel_size)
+    grid = _grid([view.surface for view in views], voxel_size)
     centres = grid.centres()
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
@@ -89,8 +86,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     # Where noise was dropped the plane next door decides; behind it is solid.
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (voxel + 0.5) * voxel_size
-    on_planes = centre + patches.normal[~noise] * patches.offset[~noise, None]  # points would count with their noise
-    hull = _hull(np.concatenate([on_planes, guessed]))
+    hull = _hull(centre + patches.normal[~noise] * patches.offset[~noise, None])  # points would count with their noise
     unknown = (hits + glimpses == 0) & _within(hull, grid)
     solid = _pieces(seen | behind | unknown)
     unseen = _unseen_surface(solid, seen)
@@ -103,8 +99,8 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
 
 
-def _grid(parts: Sequence[Float[np.ndarray, "N 3"]], voxel_size: float) -> FusionGrid:
-    points = np.concatenate(parts)
+def _grid(surfaces: Sequence[Surface], voxel_size: float) -> FusionGrid:
+    points = np.concatenate([surface.points for surface in surfaces])
     low, high = points.min(0), points.max(0)
     low[:2], high = low[:2] - voxel_size, high + voxel_size
     low[2] = -voxel_size / 2

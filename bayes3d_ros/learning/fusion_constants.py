@@ -40,9 +40,3 @@ LOW = 0.012  # metres: voxels so near to the table are free where the table is s
 FEWEST_VOXELS = 4  # of a piece that is kept
 FOOT = 0.015  # metres: what is seen so low is taken to reach down to the table
 THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)
-
-# The hidden side of an object that one view shows (`half_turn.py`)
-# Share of the turned points that may lie in free space: noise at outlines. Chosen on 14 YCB meshes, each at three yaws.
-MOST_TURNED_FREE = 0.03
-# Of the object's size: how far behind the middle of what is seen an axis may lie, and to its sides. The first tried.
-FARTHEST_AXIS, SIDEWAYS = 0.5, 0.25

@@ -66,7 +66,9 @@ class Learned:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of this model, one line each."""
         used = {number: view for number, view in enumerate(self.views, 1) if not view.refused}
-        one = ("learned from one view: the side that it hides is unknown, and guessed from the side that was seen",)
+        one = (
+            "learned from one view: the side that it hides is unknown, and closed by the convex hull of what was seen",
+        )
         cut = [f"view {k}" for k, view in used.items() if view.cut_off]
         beyond = (f"the border of the image cuts the object off in {', '.join(cut)}: what is beyond is not seen",)
         return (*(one if len(used) == 1 else ()), *(beyond if cut else ()))

@@ -15,11 +15,6 @@ class LearningTuning(NamedTuple):
     # Metres within which partners are looked for, round by round; not recorded.
     reaches: tuple[float, ...] = (*[0.03] * 4, *[0.02] * 4, *[0.012] * 3, *[0.008] * 3, *[0.005] * 2)
     most_voxels: int = 4_000_000  # of a grid, at most (`fuse.py`); not recorded
-    # Axes of half a turn (`half_turn.py`): points that are turned, axes side by side, metres from one row to the next;
-    # the first values tried.
-    turned_points: int = 400
-    axes_in_a_row: int = 21
-    axis_step: float = 0.002
 
 
 TUNING = LearningTuning()
