@@ -36,8 +36,8 @@ def plot_model(model: ObjectModel, path: Path, title: str = "", verdict: Verdict
         figure.text(0.02, 0.855, words, fontsize=9.5, color=GOOD if verdict.healthy else BAD, va="top")
     reach = model_reach(model)
     for k, (name, angle) in enumerate((*_SIDES, ("above", None))):
-        axis = figure.add_axes((0.04 + 0.193 * k, 0.09, 0.175, 0.67))
-        draw_model(axis, model, angle, reach, panel=175)
+        axis = figure.add_axes((0.04 + 0.193 * k, 0.09, 0.16, 0.67))
+        draw_model(axis, model, angle, reach, panel=160)
         axis.set_title(name, fontsize=9.5, color=INK)
         axis.tick_params(labelsize=7.5, colors=INK)
         axis.set_xlabel("mm", fontsize=8, color=INK, labelpad=1)

@@ -105,7 +105,8 @@ def _camera(axis: Axes, view: TableView, T: Float[np.ndarray, "4 4"]) -> list[Ar
     left = shown[0] < (view.x[0] + view.x[1]) / 2
     axis.annotate(
         words, shown, (10 if left else -10, 0), textcoords="offset points", fontsize=8.5, color=INK,
-        ha="left" if left else "right", va="center",
+        ha="left" if left else "right", va="center", zorder=7,
+        bbox={"boxstyle": "square,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
     )  # fmt: skip
     return [_marker("s", INK, "camera, and where it looks")]
 
