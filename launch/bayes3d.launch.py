@@ -2,8 +2,8 @@
 
 """Start scene_parser, and optionally a bag and RViz.
 
-    ros2 launch bayes3d_ros bayes3d.launch.py library:=/path/to/library depth:=/camera/depth/image_rect_raw \
-        camera_info:=/camera/depth/camera_info
+    ros2 launch bayes3d_ros bayes3d.launch.py library:=/path/to/library depth:=/camera/camera/depth/image_rect_raw \
+        camera_info:=/camera/camera/depth/camera_info
 """
 
 from launch import LaunchDescription

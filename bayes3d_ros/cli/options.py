@@ -5,6 +5,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import Field, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -152,6 +153,14 @@ def _value_name(field: Field) -> str:
     return f"{element_type(field).__name__},..." if kind is tuple else kind.__name__
 
 
+def refuse_library_as_results(out: Path, library: Path) -> None:
+    """Results hold files that would be taken for models."""
+    if out.resolve() == library.resolve():
+        raise InputError(
+            f"--out {out}: expected another folder than the library's: results there would count as models"
+        )
+
+
 def settings_from(kind: type[Settings], more: tuple[str, ...], options: dict[str, Any]) -> Settings:
     """Settings from the command's own options and from --set NAME=VALUE."""
     known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
@@ -161,7 +170,9 @@ def settings_from(kind: type[Settings], more: tuple[str, ...], options: dict[str
         if retired := retirement(name, known):
             raise InputError(f"--set {text}: {retired}")
         if name not in known:
-            raise InputError(f"--set {text}: expected one of {', '.join(known)}")
+            near = get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise InputError(f"--set {text}: {hint}expected one of {', '.join(known)}")
         try:
             chosen[name] = _value(known[name], value)
         except (ValueError, KeyError):

@@ -16,6 +16,7 @@ from bayes3d_ros.cli.options import (
     compute_unless_chosen,
     device_option,
     names_in,
+    refuse_library_as_results,
     seed_option,
     settings_from,
     settings_option,
@@ -111,6 +112,7 @@ def parse(
     from bayes3d_ros.objects.model import type_names
     from bayes3d_ros.objects.store import load_library
 
+    refuse_library_as_results(out, library)
     writers = recordings(mcap, bag)
     settings = settings_from(ParserSettings, more, options)
     compute_unless_chosen(settings.likelihood)

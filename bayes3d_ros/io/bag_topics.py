@@ -42,7 +42,8 @@ def choose_info_topic(contents: BagContents, depth_topic: str) -> str:
     if sibling in infos or len(infos) == 1:
         return sibling if sibling in infos else infos[0]
     has = ", ".join(f"{name} ({msgtype})" for name, msgtype in contents.types.items())
-    raise BagError(f"{contents.bag}: expected {CAMERA_INFO} on {sibling}, or a single such topic; the bag has {has}")
+    expected = f"expected {CAMERA_INFO} on {sibling}, or a single such topic (record it with the images)"
+    raise BagError(f"{contents.bag}: {expected}; the bag has {has}")
 
 
 def choose_pose_topic(contents: BagContents, depth_topic: str) -> str | None:

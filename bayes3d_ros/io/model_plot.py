@@ -27,7 +27,7 @@ def plot_model(model: ObjectModel, path: Path, title: str = "", verdict: Verdict
     about. Returns path."""
     figure = Figure(figsize=(14, 4.9), facecolor="white")
     FigureCanvasAgg(figure)
-    heading = f"{model.name}: {size_words(model)}, voxels of {1e3 * model.voxel_size:g} mm"
+    heading = f"{model.name}: smallest box {size_words(model)}, voxels of {1e3 * model.voxel_size:g} mm"
     figure.text(0.02, 0.965, heading, fontsize=12, fontweight="bold", color=INK, va="top")
     told = "\n".join(wrap(title, 170))
     figure.text(0.02, 0.905, told, fontsize=9.5, color=INK, va="top")
@@ -60,8 +60,7 @@ def draw_model(axis: Axes, model: ObjectModel, angle: float | None, reach: float
     views = np.ones(len(points)) if model.surface_views is None else model.surface_views
     across, up, depth, shade = _seen_from(points, normals, angle)
     right, high = _in_picture(middle, angle)
-    front = normals @ _towards(angle) > -0.1
-    order = np.flatnonzero(front)[np.argsort(depth[front])]
+    order = np.argsort(depth)  # nearer voxels cover those behind; thin walls have voxels with normals of either side
     colour = np.where((views > 0)[:, None], _SEEN, _UNSEEN) * shade[:, None]
     size = (1.5 * panel * model.voxel_size / (2 * reach)) ** 2
     x, y = 1e3 * (across[order] + right), 1e3 * (up[order] + high)
@@ -98,5 +97,6 @@ def _seen_from(points, normals, angle):
     """Coordinates in the picture, nearness, and brightness."""
     towards, (right, up) = _towards(angle), _axes(angle)
     light = _LIGHT[0] * right - _LIGHT[1] * towards + _LIGHT[2] * up
-    shade = 0.45 + 0.55 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+    facing = np.where((normals @ towards < 0)[:, None], -normals, normals)  # the side that is seen
+    shade = 0.45 + 0.55 * np.clip(facing @ light / np.linalg.norm(light), 0, 1)
     return points @ right, points @ up, points @ towards, shade

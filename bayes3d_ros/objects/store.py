@@ -184,7 +184,7 @@ def load_library(folder: Path) -> Library:
         raise LibraryError(f"{folder}: {why}")
     paths = sorted(path for path in folder.glob("*.npz") if not path.name.startswith("."))
     if not paths:
-        raise LibraryError(f"{folder}: the library holds no models (*.npz)")
+        raise LibraryError(f"{folder}: the library holds no models (*.npz); bayes3d import and bayes3d learn make them")
     found: dict[str, tuple[Path, ObjectModel]] = {}
     for path in paths:
         model = load_model(path)

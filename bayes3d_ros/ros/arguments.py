@@ -45,7 +45,7 @@ def usage(name: str, description: str) -> str:
 {description}
 
 Topics, services and parameters: docs/ros.md. Parameters are set by -p or --params-file{listed}, topics renamed by -r:
-    {name} --ros-args -p library:=objects -r depth/image_rect:=/camera/depth/image_rect_raw
+    {name} --ros-args -p library:=objects -r depth/image_rect:=/camera/camera/depth/image_rect_raw
 """
 
 

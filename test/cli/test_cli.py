@@ -218,6 +218,7 @@ def test_a_damaged_bag_gives_the_frames_before_the_damage(bag, library, parsers,
     [
         (["--particles", "0"], "particles"),
         (["--set", "nonsense=1"], "nonsense"),
+        (["--set", "max_object=1"], "did you mean max_objects? expected one of"),
         (["--set", "rejuvenation=2"], "--set rejuvenation=2: this name is retired, use rejuvenated_objects"),
         (["--set", "window=wide"], "window=int"),
         (["--set", "window=4"], "odd"),
@@ -247,6 +248,9 @@ def test_bad_files_are_named(bag, library, parsers, tmp_path):
     (tmp_path / "file").write_text("")
     save_model(model_from_mesh(trimesh.creation.box((0.05, 0.04, 0.03)), "block", 0.01), library, replace=True)
     bad_out = ("parse", bag, "--library", library, "--out")
+    before = sorted(library.iterdir())
+    assert_one_line(run(*bad_out, library), 2, f"--out {library}: expected another folder than the library's")
+    assert sorted(library.iterdir()) == before
     assert_one_line(run(*bad_out, tmp_path / "file"), 2, tmp_path / "file")
     assert_one_line(run(*bad_out, tmp_path / "file" / "sub"), 2, tmp_path / "file" / "sub")
     assert_one_line(run("parse", bag, "--library", tmp_path / "file", *out), 2, tmp_path / "file", "is a file")

@@ -57,7 +57,7 @@ def test_an_object_does_not_stand_on_its_tip():
 
 def test_the_picture_of_a_model_is_headed_by_its_size_in_millimetres(box, tmp_path, words):
     path = plot_model(box, tmp_path / "new" / "box.png", "imported from box.stl", Verdict(False, "Check: made up"))
-    assert words == ["box: 60 x 90 x 120 mm, voxels of 5 mm", "imported from box.stl", "Check: made up"]
+    assert words == ["box: smallest box 60 x 90 x 120 mm, voxels of 5 mm", "imported from box.stl", "Check: made up"]
     assert imread(path).shape == (392, 1120, 4)
 
 
