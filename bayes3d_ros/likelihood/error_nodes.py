@@ -24,6 +24,10 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 # Scales of all amplitudes of objects, and the table's tau about `wave`: log normal.
 AMPLITUDE_LOG_SD = 0.6
 HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
+# tau, as a share of `surface_waves`, where errors have the size that the settings are for: the median of 24 simulated
+# tables (0.63, standard deviation of its log 0.15; twice and three times the errors 1.24 and 1.83).
+TABLE_SHARE = 0.63
+SENSOR_LOG_SD = 0.2  # of tau about what the sensor's other errors say
 _PAIRS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # standard deviations of log sigma, logit p_out
 _STANDING = 0.008  # metres in front of the table from which returns that touch are an object's
 _LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
@@ -85,6 +89,19 @@ def error_nodes(
     log_weight = log_noise[:, None] + log_tables
     scale = np.exp(AMPLITUDE_LOG_SD * places)
     return ErrorNodes(*(a.astype(np.float32) for a in (sigma, p_outlier, tables, scale, log_weight, np.log(weights))))
+
+
+def sensor_scale(nodes: ErrorNodes, wave: float) -> float:
+    """How large the errors of the whole image and of the table are, of what the settings say: the sensor's scale c.
+
+    No return shows these errors themselves. But tau, which the table's returns show, grows with c: log tau is normal
+    about log(c TABLE_SHARE wave) with standard deviation SENSOR_LOG_SD, and log c about 0 with AMPLITUDE_LOG_SD. This
+    is exp of the mean of log c given tau. 1 where the table has no errors of its own.
+    """
+    if wave <= 0:
+        return 1.0
+    tau = float(nodes.table[len(nodes.table) // 2])
+    return (tau / (TABLE_SHARE * wave)) ** (AMPLITUDE_LOG_SD**2 / (AMPLITUDE_LOG_SD**2 + SENSOR_LOG_SD**2))
 
 
 def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErrors:

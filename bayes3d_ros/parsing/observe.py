@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame, reduced, scored_size
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, Likelihood
+from bayes3d_ros.likelihood.error_nodes import sensor_scale
 from bayes3d_ros.likelihood.scored_image import ScoredImage, scored_image
 from bayes3d_ros.likelihood.shared_errors import Amplitudes, SharedErrorImage, shared_error_image
 from bayes3d_ros.objects.placement import Table
@@ -34,6 +35,7 @@ class Observation(NamedTuple):
     usable_share: float  # of the scored pixels on the table (`support_plane.py`)
     notes: list[str]  # on where the table comes from
     found: bool = False  # whether the table was found in the image, and not given by a pose
+    error_scale: float = 1.0  # of errors that no return shows, see `error_nodes.sensor_scale`
 
     @property
     def T_camera_table(self) -> Float[np.ndarray, "4 4"]:
@@ -58,10 +60,12 @@ def observe(frame: DepthFrame, settings: ParserSettings) -> Observation:
     pixel_class = workspace(points, T_camera_table, table_size, settings.workspace_height)
     depth = np.where(returned, depth, 0.0)
     image, errors = _as_scored(camera, depth, pixel_class, T_camera_table, settings)
+    scale = 1.0 if errors is None else sensor_scale(errors.nodes, settings.surface_waves)
+    table = table._replace(image_sd=scale * table.image_sd)
     usable = usable_share(pixel_class, camera.rays(), T_camera_table, table_size, settings.far)
     placed = table_of(T_camera_table, settings)
     notes = ["table found in the depth image"] if found else []
-    return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes, found)
+    return Observation(image, errors, placed, camera, depth, pixel_class, table, usable, notes, found, scale)
 
 
 def table_of(T_camera_table: Float[np.ndarray, "4 4"], settings: ParserSettings) -> Table:

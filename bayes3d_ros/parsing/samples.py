@@ -82,16 +82,13 @@ def mixture(
     things = [held for held in things for _ in range(2)]
     moved = _moved(table_error)
     held = np.arange(objects.type.shape[1]) < n[keep, None]
-    T = np.asarray(table.T_camera_table, np.float64) @ moved @ _T_table_object(objects, library)
+    T_camera_table = np.asarray(table.T_camera_table, np.float64)
     off = np.concatenate([s.off for s in stages])[keep]
+    T = _on_true_table(objects, T_camera_table, moved, library)
     T = _along_rays(T, _table_bias(off, held, gauss[:, 1, 0], bias))
-    known = _Slots(
-        type=np.where(held, objects.type, -1),
-        face=np.where(held, objects.face, -1),
-        T_camera_object=T,
-        size=np.zeros((*held.shape, 3)),
-    )
-    every = _with_things(known, n[keep], things, int(library.num_types), seen.T_camera_table @ moved[:, 0])
+    kinds, faces = (np.where(held, a, -1) for a in (objects.type, objects.face))
+    known = _Slots(kinds, faces, T, np.zeros((*held.shape, 3)))
+    every = _with_things(known, n[keep], things, int(library.num_types), T_camera_table, moved)
     held = every.type >= 0
     T = every.T_camera_object
     quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
@@ -182,7 +179,8 @@ def _with_things(
     count: Int[np.ndarray, "S"],
     things: Sequence[tuple[UnknownThing, ...]],
     unknown_type: int,
-    T_camera_table: Float[np.ndarray, "S 4 4"],
+    T_camera_table: Float[np.ndarray, "4 4"],
+    moved: Float[np.ndarray, "S 1 4 4"],
 ) -> _Slots:
     """Unknown things are added to the slots after the known objects of each sample."""
     most = max((len(t) for t in things), default=0)
@@ -201,7 +199,8 @@ def _with_things(
             slot = int(count[s]) + k
             size[s, slot], centre, yaw = drawn_box(thing, np.mod(s * _EVENLY + 0.31 * k, 1.0))
             kind[s, slot] = unknown_type
-            T[s, slot] = T_camera_table[s] @ slide(*(np.array(a) for a in (*centre, yaw)))
+            T[s, slot] = T_camera_table @ moved[s, 0] @ slide(*(np.array(a) for a in (*centre, yaw)))
+            T[s, slot, :3, 3] += _to_own_rays(T_camera_table, moved[s : s + 1], centre[None, None])[0, 0]
     return _Slots(kind, face, T, size)
 
 
@@ -211,6 +210,36 @@ def _moved(table_error: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 1 4 4"
     moved[:, 0, :3, :3] = Rotation.from_rotvec(table_error * [1, 1, 0]).as_matrix()
     moved[:, 0, 2, 3] = table_error[:, 2]
     return moved
+
+
+def _on_true_table(
+    objects: Placement,
+    T_camera_table: Float[np.ndarray, "4 4"],
+    moved: Float[np.ndarray, "S 1 4 4"],
+    library: LibraryArrays,
+) -> Float[np.ndarray, "S M 4 4"]:
+    """T_camera_object of objects that are seen on one table, where they stand on the true one."""
+    T = T_camera_table @ moved @ _T_table_object(objects, library)
+    T[..., :3, 3] += _to_own_rays(T_camera_table, moved, np.stack([objects.x, objects.y], -1))
+    return T
+
+
+def _to_own_rays(
+    T_camera_table: Float[np.ndarray, "4 4"], moved: Float[np.ndarray, "S 1 4 4"], xy: Float[np.ndarray, "S M 2"]
+) -> Float[np.ndarray, "S M 3"]:
+    """What to add to places in the camera's frame once the table is moved, so that pictures stay.
+
+    The table that the returns show differs from the true one by errors of depth, along rays. So an object that is seen
+    to stand at x, y stands where its ray meets the true table, and not straight above or below.
+    """
+    on_table = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1)), np.ones((*xy.shape[:-1], 1))], -1)
+    seen = (on_table @ T_camera_table.T)[..., :3]
+    T = T_camera_table @ moved
+    shifted = np.einsum("smij,smj->smi", np.broadcast_to(T, (*xy.shape[:-1], 4, 4)), on_table)[..., :3]
+    normal, origin = T[..., :3, 2], T[..., :3, 3]
+    towards = (normal * seen).sum(-1)
+    along = np.where(np.abs(towards) > 1e-6, (normal * origin).sum(-1) / np.where(towards == 0, 1.0, towards), 1.0)
+    return np.clip(along, 0.5, 2.0)[..., None] * seen - shifted
 
 
 def _T_table_object(objects: Placement, library: LibraryArrays) -> Float[np.ndarray, "S M 4 4"]:

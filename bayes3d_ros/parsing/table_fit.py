@@ -26,12 +26,27 @@ _TILT_ARM = 0.5  # metres across the table over which depth errors may differ by
 
 
 class SeenTable(NamedTuple):
-    """T_camera_table of the plane that the returns show; and of the true table relative to it, mean and standard
-    deviation of tilts about x and y (radians) and of height (metres)."""
+    """T_camera_table of the plane that the returns show, and what is known of the true table besides: tilts about x
+    and y (radians) and height (metres)."""
 
     T_camera_table: Float[np.ndarray, "4 4"]
-    error: Float[np.ndarray, "3"]
-    error_sd: Float[np.ndarray, "3"]
+    offset: Float[np.ndarray, "3"]  # from the plane that was given to the one that the returns show
+    given_sd: Float[np.ndarray, "3"]  # of the true table about the one that was given
+    image_sd: Float[np.ndarray, "3"]  # of the plane that the returns show about the true table
+
+    @property
+    def error(self) -> Float[np.ndarray, "3"]:
+        """Mean of the true table relative to the plane that the returns show."""
+        return -self.offset * self.image_sd**2 / self._total
+
+    @property
+    def error_sd(self) -> Float[np.ndarray, "3"]:
+        """Its standard deviation."""
+        return self.given_sd * self.image_sd / np.sqrt(self._total)
+
+    @property
+    def _total(self) -> Float[np.ndarray, "3"]:
+        return np.maximum(self.given_sd**2 + self.image_sd**2, 1e-30)
 
 
 def seen_table(
@@ -40,20 +55,19 @@ def seen_table(
     """The plane that the returns show, and the true table relative to it. points: returns in the camera frame;
     found: whether the given plane was found in them."""
     if found:
-        prior = np.array([_FOUND_TILT, _FOUND_TILT, _FOUND_HEIGHT]) ** 2
+        given_sd = np.array([_FOUND_TILT, _FOUND_TILT, _FOUND_HEIGHT])
     else:
         angle = settings.camera_angle_sigma
-        prior = np.array([angle, angle, settings.camera_position_sigma]) ** 2
+        given_sd = np.array([angle, angle, settings.camera_position_sigma])
     depth = settings.image_bias
-    error = np.array([depth / _TILT_ARM, depth / _TILT_ARM, depth]) ** 2
+    image_sd = np.array([depth / _TILT_ARM, depth / _TILT_ARM, depth])
     offset = np.zeros(3) if found else _offset(points, T_camera_table)
-    if (np.abs(offset) > _FARTHEST_SDS * np.sqrt(prior + error)).any():
+    if (np.abs(offset) > _FARTHEST_SDS * np.sqrt(given_sd**2 + image_sd**2)).any():
         offset = np.zeros(3)
     moved = np.eye(4)
     moved[:3, :3] = Rotation.from_rotvec(offset * [1, 1, 0]).as_matrix()
     moved[2, 3] = offset[2]
-    total = np.maximum(prior + error, 1e-30)
-    return SeenTable(T_camera_table @ moved, -offset * error / total, np.sqrt(prior * error / total))
+    return SeenTable(T_camera_table @ moved, offset, given_sd, image_sd)
 
 
 def _offset(points: Float[np.ndarray, "N 3"], T_camera_table: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:

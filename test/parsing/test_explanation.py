@@ -22,7 +22,7 @@ EVERYWHERE = ((-np.inf, -np.inf), (np.inf, np.inf))
 
 def seen(depth: np.ndarray, pixel_class: np.ndarray | None = None, region: object = EVERYWHERE) -> Observation:
     pixel_class = np.full(depth.shape, IN_WORKSPACE) if pixel_class is None else pixel_class
-    table = SeenTable(T_CAMERA_TABLE, np.zeros(3), np.zeros(3))
+    table = SeenTable(T_CAMERA_TABLE, np.zeros(3), np.zeros(3), np.zeros(3))
     placed = Table(T_CAMERA_TABLE, np.ones(2), np.asarray(region))
     return Observation(None, None, placed, CAMERA, depth, pixel_class, table, 1.0, [])
 

@@ -5,7 +5,8 @@
 import numpy as np
 import pytest
 
-from bayes3d_ros.parsing.samples import _along_rays, _table_bias
+from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, SENSOR_LOG_SD, TABLE_SHARE, ErrorNodes, sensor_scale
+from bayes3d_ros.parsing.samples import _along_rays, _moved, _table_bias, _to_own_rays
 
 BIAS = 0.0012
 
@@ -41,3 +42,33 @@ def test_empty_slots_stay():
     """Their poses have no depth."""
     T = np.tile(np.eye(4), (1, 1, 1, 1))
     assert np.array_equal(_along_rays(T, np.array([0.01])), T)
+
+
+def test_an_object_stays_on_its_ray_and_stands_on_the_true_table():
+    """The true table lies 4 mm above the one that the returns show, turned by half a degree: pictures stay."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    T = np.array([[1, 0, 0, 0.02], [0, -s, -c, 0.05], [0, c, -s, 0.8], [0, 0, 0, 1.0]])
+    moved = _moved(np.array([[0.008, -0.003, 0.004], [0.0, 0.0, 0.0], [0.0, 0.0, 0.004]]))
+    xy = np.array([[[0.1, 0.2], [-0.3, -0.1]]] * 3)
+    on_table = np.concatenate([xy, np.zeros((3, 2, 1)), np.ones((3, 2, 1))], -1)
+    before = on_table @ T.T
+    after = np.einsum("smij,smj->smi", np.broadcast_to(T @ moved, (3, 2, 4, 4)), on_table)
+    after[..., :3] += _to_own_rays(T, moved, xy)
+    np.testing.assert_allclose(after[..., :2] / after[..., 2:3], before[..., :2] / before[..., 2:3], atol=1e-12)
+    height = np.einsum("ij,smj->smi", np.linalg.inv(T @ moved[0, 0]), after)[0, :, 2]
+    np.testing.assert_allclose(height, 0.0, atol=1e-12)
+    np.testing.assert_allclose(after[1], before[1], atol=1e-12)
+    assert np.linalg.norm(after[2] - before[2], axis=-1).min() > 1.3 * 0.004  # farther than the table itself
+
+
+def test_the_sensors_scale_is_its_mean_given_what_the_table_shows():
+    """Against a sum over log c, whose prior is log normal, as is tau given c."""
+    wave, log_c = 0.001, np.linspace(-5, 5, 20_001)
+    for tau in (0.0003, TABLE_SHARE * wave, 0.0018):
+        apart = np.log(tau) - np.log(TABLE_SHARE * wave) - log_c
+        density = np.exp(-0.5 * (log_c / AMPLITUDE_LOG_SD) ** 2 - 0.5 * (apart / SENSOR_LOG_SD) ** 2)
+        nodes = ErrorNodes(
+            *(np.zeros(1) for _ in range(2)), np.array([9.0, tau, 9.0]), *(np.zeros(1) for _ in range(3))
+        )
+        assert np.log(sensor_scale(nodes, wave)) == pytest.approx((density * log_c).sum() / density.sum(), abs=1e-6)
+    assert sensor_scale(nodes, 0.0) == 1.0
