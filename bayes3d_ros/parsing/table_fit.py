@@ -59,8 +59,10 @@ def seen_table(
     else:
         angle = settings.camera_angle_sigma
         given_sd = np.array([angle, angle, settings.camera_position_sigma])
-    depth = settings.image_bias
-    image_sd = np.array([depth / _TILT_ARM, depth / _TILT_ARM, depth])
+    # An error of depth acts along rays, and moves the plane by its part along the normal.
+    origin = T_camera_table[:3, 3]
+    height = settings.image_bias * abs(float(T_camera_table[:3, 2] @ origin)) / max(float(origin[2]), _NEAR)
+    image_sd = np.array([height / _TILT_ARM, height / _TILT_ARM, height])
     offset = np.zeros(3) if found else _offset(points, T_camera_table)
     if (np.abs(offset) > _FARTHEST_SDS * np.sqrt(given_sd**2 + image_sd**2)).any():
         offset = np.zeros(3)

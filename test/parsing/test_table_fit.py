@@ -43,17 +43,32 @@ def test_where_the_plane_was_taken_to_be_does_not_matter(tilts, height):
     assert abs(across @ near.T_camera_table[:3, 2]) < 0.1 * near.error_sd[2]
 
 
-def test_the_table_itself_lies_between_the_plane_given_and_the_one_seen():
+def of_the_image():
+    """Standard deviation of the plane's height: of an error of depth, which acts along rays, the part along the
+    normal."""
     T = given()
+    return SETTINGS.image_bias * abs(T[:3, 2] @ T[:3, 3]) / T[2, 3]
+
+
+def test_the_table_itself_lies_between_the_plane_given_and_the_one_seen():
+    T, image, pose = given(), of_the_image(), 0.002
     seen = seen_table(returns(moved(T, height=0.003)), T, False, SETTINGS)
-    assert seen.error[2] == pytest.approx(-0.003 * 1 / (1 + 4), abs=1e-4)  # variances 0.001^2 and 0.002^2
-    assert seen.error_sd[2] == pytest.approx(0.001 * 0.002 / np.hypot(0.001, 0.002), rel=1e-3)
+    assert seen.error[2] == pytest.approx(-0.003 * image**2 / (image**2 + pose**2), abs=1e-4)
+    assert seen.error_sd[2] == pytest.approx(image * pose / np.hypot(image, pose), rel=1e-3)
+
+
+def test_errors_of_the_image_grow_with_the_sensors_scale():
+    seen = seen_table(returns(moved(given(), height=0.003)), given(), False, SETTINGS)
+    wider = seen._replace(image_sd=3 * seen.image_sd)
+    image, pose = 3 * of_the_image(), 0.002
+    assert wider.error[2] == pytest.approx(-seen.offset[2] * image**2 / (image**2 + pose**2), rel=1e-6)
+    assert wider.error_sd[2] == pytest.approx(image * pose / np.hypot(image, pose), rel=1e-6)
 
 
 def test_of_a_plane_that_was_found_only_errors_of_depth_are_unknown():
     seen = seen_table(returns(given()), given(), True, SETTINGS)
     assert (seen.T_camera_table == given()).all() and (seen.error == 0).all()
-    assert seen.error_sd[2] == pytest.approx(SETTINGS.image_bias, rel=1e-3)
+    assert seen.error_sd[2] == pytest.approx(of_the_image(), rel=1e-3)
 
 
 def test_another_surface_is_not_taken_for_the_table():
