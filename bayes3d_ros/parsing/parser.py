@@ -279,9 +279,8 @@ class SceneParser:
             reached = [k for k, stage in enumerate(stages) if np.isfinite(stage.log_evidence)]
             if not reached or (not settings.knows_unknown and len(stages) != settings.fixed_objects + 1):
                 raise ParseError(f"no scene of {settings.fixed_objects} objects was found (fixed_objects)")
-        outline, bias = (
-            (settings.outline_sigma, seen.error_scale * settings.surface_bias) if settings.shares_errors else (0.0, 0.0)
-        )
+        outline, bias = (settings.outline_sigma, settings.surface_bias) if settings.shares_errors else (0.0, 0.0)
+        bias *= seen.error_scale
         return mixture(stages, range(len(stages)), log_prior, self._arrays, seen.table, seen.seen_table, outline, bias)
 
     def _reconstruct(self, frame: DepthFrame, seen: Observation, scene: BestScene):

@@ -194,13 +194,16 @@ def _with_things(
         for a, fill in ((known.type, -1), (known.face, -1), (known.size, 0))
     )
     T = np.concatenate([known.T_camera_object, np.broadcast_to(np.eye(4), (len(kind), more, 4, 4))], 1)
+    added = []  # sample, slot, centre of each
     for s, held in enumerate(things):
         for k, thing in enumerate(held):
             slot = int(count[s]) + k
             size[s, slot], centre, yaw = drawn_box(thing, np.mod(s * _EVENLY + 0.31 * k, 1.0))
             kind[s, slot] = unknown_type
             T[s, slot] = T_camera_table @ moved[s, 0] @ slide(*(np.array(a) for a in (*centre, yaw)))
-            T[s, slot, :3, 3] += _to_own_rays(T_camera_table, moved[s : s + 1], centre[None, None])[0, 0]
+            added.append((s, slot, centre))
+    sample, slots, centres = zip(*added, strict=True)
+    T[sample, slots, :3, 3] += _to_own_rays(T_camera_table, moved[list(sample)], np.array(centres)[:, None])[:, 0]
     return _Slots(kind, face, T, size)
 
 

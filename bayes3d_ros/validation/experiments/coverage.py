@@ -128,7 +128,8 @@ def scene_row(k: int, label: str, scene: RandomScene, parser: SceneParser) -> Ro
         "sigma": round(posterior.sigma, 7),
         "seconds": round(posterior.seconds, 3),
     }
-    return row | object_row(scene, posterior, parser.library.models[0])
+    model = parser.library.models[0]
+    return row | object_row(sampled_object(scene, posterior, model), model.name)
 
 
 class SampledObject(NamedTuple):
@@ -173,9 +174,8 @@ def sampled_object(scene: RandomScene, posterior: ScenePosterior, model: ObjectM
     return SampledObject(sample, samples.type[sample, slot], weights, float(total), off, yaw, tilt, view)
 
 
-def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel) -> Row:
-    """Credible regions of the estimate nearest to the object; nothing if there is none near it."""
-    told = sampled_object(scene, posterior, model)
+def object_row(told: SampledObject | None, name: str) -> Row:
+    """Credible regions of an object of this type; nothing if it was not found."""
     if told is None:
         return {}
     _, _, weights, total, off, yaw, tilt, view = told
@@ -186,15 +186,20 @@ def object_row(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel
         "across": central_interval(off @ [-view[1], view[0]], weights, 0.0),
         "position": ellipsoid(off, weights),
     }
-    if SYMMETRIES[model.name].has_yaw:
+    if SYMMETRIES[name].has_yaw:
         found["yaw"] = angle_interval(yaw, weights)
         found["pose"] = ellipsoid(np.column_stack([off, yaw]), weights)
     return {
         "probability": round(total, 6),
         "samples_ess": round(float(1 / (weights**2).sum()), 2),
         "right_rest": round(float(weights[tilt < RIGHT_REST_WITHIN].sum()), 5),
-        **{name: {key: round(v, 8) for key, v in said._asdict().items()} for name, said in found.items()},
+        **told_regions(found),
     }
+
+
+def told_regions(found: dict[str, Credible]) -> Row:
+    """Regions as JSON values."""
+    return {name: {key: round(v, 8) for key, v in said._asdict().items()} for name, said in found.items()}
 
 
 def line(row: Row) -> str:

@@ -15,7 +15,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bayes3d_ros.io.palette import colour
-from bayes3d_ros.objects.model import ObjectModel
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.coverage import (
@@ -24,10 +23,11 @@ from bayes3d_ros.validation.experiments.coverage import (
     object_row,
     quantity,
     sampled_object,
+    told_regions,
 )
 from bayes3d_ros.validation.experiments.open_world import YcbWorld, ycb_world
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
-from bayes3d_ros.validation.simulate.mixed_tables import RandomTable, random_table
+from bayes3d_ros.validation.simulate.mixed_tables import RandomTable, table_of_a_choice
 from bayes3d_ros.validation.simulate.random_scenes import RandomScene
 from bayes3d_ros.validation.simulate.ray_casting import SimulationError
 from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise
@@ -43,7 +43,6 @@ MOST_WIDE = 4.0  # RMS errors: of a 90 % region
 TABLES, QUICK_TABLES = 100, 5  # for each amplitude
 FULL_SEED, QUICK_SEED = 600_000, 690_000
 OBJECTS = 2
-_CHOICES = 20  # of types and places before a table is given up
 OWN = ("x", "y", "range", "across", "yaw", "position")
 RELATIVE = ("apart_x", "apart_y", "apart_yaw", "apart")  # of the two objects
 QUANTITIES = OWN + RELATIVE
@@ -84,26 +83,20 @@ def table_rows(seed: int, amplitude: float, world: YcbWorld) -> list[Row]:
         posterior = world.parser().parse(table.frame)
     except (SimulationError, ParseError) as error:
         return [row | {"error": str(error)}]
-    scenes = [_alone(table, k) for k in range(OBJECTS)]
-    models = [world.models[scene.name] for scene in scenes]
-    row |= {"objects": [scene.name for scene in scenes], "seconds": round(posterior.seconds, 3)}
-    own = []
-    for scene, model in zip(scenes, models, strict=True):
-        told = object_row(scene, posterior, model) if _named(scene, posterior, model, world) else {}
-        own.append(row | {"objects": [scene.name]} | {name: told.get(name) for name in OWN})
-    return [*own, row | (_relative(scenes, models, posterior) if all(r["position"] for r in own) else {})]
+    names = [own.thing.name for own in table.objects]
+    found = [_found(_alone(table, k), posterior, world) for k in range(OBJECTS)]
+    row |= {"objects": names, "seconds": round(posterior.seconds, 3)}
+    rows = []
+    for name, told in zip(names, found, strict=True):
+        said = object_row(told, name)
+        rows.append(row | {"objects": [name]} | {quantity: said.get(quantity) for quantity in OWN})
+    return [*rows, row | _relative(names, found)]
 
 
 def _table(seed: int, amplitude: float, world: YcbWorld) -> RandomTable:
     """Two of the types whose symmetries are known; of the choices, the first one that can be made."""
-    rng, problem = np.random.default_rng([seed, 17]), SimulationError("expected a table that can be made")
-    for trial in range(_CHOICES):
-        names = rng.choice(COVERED_TYPES, OBJECTS, False)
-        try:
-            return random_table([world.known(str(name)) for name in names], amplitude, seed + 1_000_000 * trial)
-        except SimulationError as error:
-            problem = error
-    raise problem
+    rng = np.random.default_rng([seed, 17])
+    return table_of_a_choice(lambda: rng.choice(COVERED_TYPES, OBJECTS, False).tolist(), world.known, amplitude, seed)
 
 
 def _alone(table: RandomTable, k: int) -> RandomScene:
@@ -116,19 +109,19 @@ def _alone(table: RandomTable, k: int) -> RandomScene:
     return RandomScene(thing.name, 0, table.frame, T, SensorNoise())
 
 
-def _named(scene: RandomScene, posterior: ScenePosterior, model: ObjectModel, world: YcbWorld) -> bool:
-    """Whether most samples of the nearest estimate are of the object's own type."""
-    told = sampled_object(scene, posterior, model)
-    if told is None:
-        return False
+def _found(scene: RandomScene, posterior: ScenePosterior, world: YcbWorld) -> SampledObject | None:
+    """The estimate nearest to the scene's object, if most of its samples are of the object's own type."""
+    told = sampled_object(scene, posterior, world.models[scene.name])
     own = world.library.names.index(scene.name)
-    return float(told.weight[told.type == own].sum()) > 0.5
+    return told if told is not None and told.weight[told.type == own].sum() > 0.5 else None
 
 
-def _relative(scenes: Sequence[RandomScene], models: Sequence[ObjectModel], posterior: ScenePosterior) -> Row:
-    """Regions of the second object's pose relative to the first one's, of the samples that hold both."""
-    one, other = (sampled_object(scene, posterior, model) for scene, model in zip(scenes, models, strict=True))
-    assert one is not None and other is not None
+def _relative(names: Sequence[str], found: Sequence[SampledObject | None]) -> Row:
+    """Regions of the second object's pose relative to the first one's, of the samples that hold both; nothing where
+    there is none."""
+    one, other = found
+    if one is None or other is None:
+        return {}
     off, yaw, weight = _differences(one, other)
     if not len(weight):
         return {}
@@ -137,9 +130,9 @@ def _relative(scenes: Sequence[RandomScene], models: Sequence[ObjectModel], post
         "apart_y": central_interval(off[:, 1], weight, 0.0),
         "apart": ellipsoid(off, weight),
     }
-    if all(SYMMETRIES[scene.name].has_yaw for scene in scenes):
+    if all(SYMMETRIES[name].has_yaw for name in names):
         said["apart_yaw"] = angle_interval(yaw, weight)
-    return {name: {key: round(v, 8) for key, v in region._asdict().items()} for name, region in said.items()}
+    return told_regions(said)
 
 
 def _differences(one: SampledObject, other: SampledObject):
@@ -197,8 +190,8 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     figure = Figure(figsize=(7.5, 4.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
-    axis.axhspan(0.86, 0.94, color=GREY, alpha=0.2, linewidth=0, label="wanted up to x 2")
-    axis.axhline(0.8, color=GREY, linewidth=1, linestyle=":", label="wanted at x 3")
+    axis.axhspan(*LIMITS[1.0], color=GREY, alpha=0.2, linewidth=0, label="wanted up to x 2")
+    axis.axhline(LIMITS[3.0][0], color=GREY, linewidth=1, linestyle=":", label="wanted at x 3")
     told = summary(rows)
     for k, name in enumerate(QUANTITIES):
         there = [(a, told[key]["coverage_90"]) for a in AMPLITUDES if (key := f"x {a:g}: {name}") in told]

@@ -27,7 +27,7 @@ from bayes3d_ros.validation.experiments import Row, Step, row_step
 from bayes3d_ros.validation.experiments.open_world_plot import plot
 from bayes3d_ros.validation.experiments.open_world_summary import WANTED, summary
 from bayes3d_ros.validation.simulate.deformations import deformed
-from bayes3d_ros.validation.simulate.mixed_tables import random_table
+from bayes3d_ros.validation.simulate.mixed_tables import table_of_a_choice
 from bayes3d_ros.validation.simulate.random_scenes import (
     REALSENSE,
     RestingObject,
@@ -52,7 +52,6 @@ KNOWN_ON_MIXED, FOREIGN_ON_MIXED, KNOWN_ON_EMPTY = (2, 4), (1, 3), (1, 3)
 MIXED_AMPLITUDE = 1.0
 EMPTY_AMPLITUDES = (0.0, 0.5, 1.0, 2.0, 3.0)  # in turn; every other table has known objects
 SURFACE_POINTS = 20_000  # of a foreign mesh, that types are aligned with
-_CHOICES_OF_THINGS = 20
 HEADER = (
     f"{'frame':>6} {'kind':<9} {'things (what was said of them)':<60} {'claim':>6} {'ghosts':>6} {'false':>5} {'s':>5}"
 )
@@ -195,22 +194,18 @@ def true_frame(job: Job, world: YcbWorld) -> TrueFrame:
 def _table(job: Job, world: YcbWorld) -> TrueFrame:
     """A table of a random choice of things; of the choices, the first one that can be made."""
     rng = np.random.default_rng([job.seed, 13])
-    problem = SimulationError("expected a table that can be made")
-    for trial in range(_CHOICES_OF_THINGS):
-        names = _choice(job, rng)
-        try:
-            things = [world.known(n) if n in world.models else world.foreign(n) for n in names]
-            table = random_table(things, job.amplitude or 0.0, job.seed + 1_000_000 * trial)
-        except SimulationError as error:
-            problem = error
-            continue
-        T_camera_table = np.linalg.inv(table.T_table_camera)
-        true = [
-            TrueThing(n, n in world.models, T_camera_table @ own.T_table_object, table.visible_fraction(k))
-            for k, (n, own) in enumerate(zip(names, table.objects, strict=True))
-        ]
-        return TrueFrame(table.frame, true, table.clean)
-    raise problem
+
+    def resting(name: str) -> RestingObject:
+        return world.known(name) if name in world.models else world.foreign(name)
+
+    table = table_of_a_choice(lambda: _choice(job, rng), resting, job.amplitude or 0.0, job.seed)
+    T_camera_table = np.linalg.inv(table.T_table_camera)
+    names = [own.thing.name for own in table.objects]
+    true = [
+        TrueThing(name, name in world.models, T_camera_table @ own.T_table_object, table.visible_fraction(k))
+        for k, (name, own) in enumerate(zip(names, table.objects, strict=True))
+    ]
+    return TrueFrame(table.frame, true, table.clean)
 
 
 def _choice(job: Job, rng: np.random.Generator) -> list[str]:

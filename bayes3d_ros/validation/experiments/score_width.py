@@ -27,7 +27,7 @@ from bayes3d_ros.posterior.types import ParseError, ScenePosterior
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, type_odds
-from bayes3d_ros.validation.experiments.coverage import COVERED_TYPES, object_row
+from bayes3d_ros.validation.experiments.coverage import COVERED_TYPES, object_row, sampled_object
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
 from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, RestingObject, random_scene, resting_object
 from bayes3d_ros.validation.simulate.scene_file import find_mesh
@@ -93,7 +93,7 @@ def _ten_rows(k: int, things: Callable[[str], RestingObject], parsers: Parsers) 
         except ParseError as error:
             rows.append(row | {"error": str(error)})
             continue
-        found = object_row(scene, posterior, parser.library.models[parser.library.names.index(thing.name)])
+        found = object_row(sampled_object(scene, posterior, parser.library.by_name[thing.name]), thing.name)
         row |= {name: found[name]["width_90"] for name in QUANTITIES if name in found}
         row |= {"p_true": round(_claimed(posterior, thing.name), 6), "seconds": round(posterior.seconds, 3)}
         rows.append(row)

@@ -2,7 +2,7 @@
 
 """Random tables of several objects that do not touch, and a camera that has all of them in view."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from bayes3d_ros.validation.simulate.shared_error_frames import (
 
 TABLE_VIEW_DISTANCES = (0.7, 1.1)  # metres from the camera to what it looks at
 FARTHEST = 0.25  # metres from the table's middle, along x and y
+TABLE_CHOICES = 20  # of things, before a table is given up
 LEAST_GAP = 0.015  # metres between objects, seen from above
 _FOOTPRINT_POINTS, _PLACE_TRIALS, _TABLE_TRIALS = 2000, 60, 30
 
@@ -61,6 +62,21 @@ def random_table(things: Sequence[RestingObject], amplitude: float, seed: int) -
     frame = shared_error_frame(objects, T_table_camera, drawn, stamp, pixels)
     clean = nearest([alone(*own, T_table_camera) for own in objects], bare_depth(T_table_camera))
     return RandomTable(frame, tuple(objects), T_table_camera, drawn, clean)
+
+
+def table_of_a_choice(
+    choose: Callable[[], Sequence[str]], resting: Callable[[str], RestingObject], amplitude: float, seed: int
+) -> RandomTable:
+    """`random_table` of the things that `choose` names: of `TABLE_CHOICES` choices the first one that can be made.
+    Raises SimulationError where none can."""
+    problem = SimulationError("expected a table that can be made")
+    for trial in range(TABLE_CHOICES):
+        names = choose()
+        try:
+            return random_table([resting(name) for name in names], amplitude, seed + 1_000_000 * trial)
+        except SimulationError as error:
+            problem = error
+    raise problem
 
 
 def _arranged(
