@@ -18,8 +18,8 @@ import bayes3d_ros
 
 # A room may import those before it. `validation` is for the commands that measure; the nodes run without it.
 ROOMS = (
-    *("resources", "jax_runtime", "settings", "files", "geometry", "objects", "likelihood", "sampling", "posterior"),
-    *("parsing", "tracking", "learning", "io", "ros", "validation", "cli"),
+    *("lists", "resources", "jax_runtime", "settings", "files", "geometry", "objects", "likelihood", "sampling"),
+    *("posterior", "parsing", "tracking", "learning", "io", "ros", "validation", "cli"),
 )
 MEASURED_THROUGH_NODES = {
     "ros/latency.py",

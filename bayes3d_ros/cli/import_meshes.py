@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from bayes3d_ros.cli.options import FILE, FOLDER, replace_option
+from bayes3d_ros.cli.options import ANY, FOLDER, replace_option
 from bayes3d_ros.cli.progress import progress
 
 
 @click.command(name="import")
-@click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FILE)
+@click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=ANY)
 @click.option("--library", required=True, type=FOLDER, help="Folder of object models; made if it does not exist.")
 @click.option(
     "--voxel-size",

@@ -67,15 +67,16 @@ def _contents_words(contents: BagContents, topic: str) -> str:
     if kind not in (CAMERA_INFO, POSE, TF):
         return ""
     try:
-        message = contents.decoded(topic)[0]
+        messages = contents.decoded(topic)
     except BagError:
         return "cannot be decoded"
+    message = messages[0]
     if kind == CAMERA_INFO:
         return f"{message.width} x {message.height}, frame {message.header.frame_id!r}"
     if kind == POSE:
         return f"in frame {message.header.frame_id!r}"
-    pairs = [f"{t.header.frame_id} -> {t.child_frame_id}" for t in message.transforms]
-    return ", ".join(pairs[:2]) + (f" and {len(pairs) - 2} more" if len(pairs) > 2 else "")
+    pairs = dict.fromkeys(f"{t.header.frame_id} -> {t.child_frame_id}" for m in messages for t in m.transforms)
+    return ", ".join(pairs)
 
 
 def _frame_facts(reader: FrameReader, contents: BagContents) -> tuple[tuple[tuple[str, str], ...], list[str]]:

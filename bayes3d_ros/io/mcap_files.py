@@ -16,8 +16,11 @@ from mcap.exceptions import InvalidMagic
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from bayes3d_ros.lists import first_few
+
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _REMEDY = "ros2 bag convert makes one"
+_FOLDERS_TOLD = 5
 _SQLITE = f"expected an MCAP file, it is of storage sqlite3 ({_REMEDY})"
 
 
@@ -100,12 +103,20 @@ def _files(bag: Path) -> list[Path]:
             )
     if not files:
         other = next(iter(sorted(bag.glob("*.db3*"))), None)
-        found = "none" if other is None else f"{other.name}, storage sqlite3 ({_REMEDY})"
+        found = f"none{_bags_inside(bag)}" if other is None else f"{other.name}, storage sqlite3 ({_REMEDY})"
         raise BagError(f"{bag}: expected an .mcap file in this folder, found {found}")
     for file in files:
         if not file.exists():
             raise BagError(f"{file}: expected this file, which {metadata.name} lists")
     return files
+
+
+def _bags_inside(folder: Path) -> str:
+    """Names the folders inside that are bags: one of them was probably meant."""
+    inside = sorted({file.parent.name for file in folder.glob("*/*.mcap")})
+    if not inside:
+        return ""
+    return f"; folders in it that hold one: {first_few(inside, _FOLDERS_TOLD)}"
 
 
 def _messages(file: Path) -> Iterator[RawMessage]:

@@ -20,12 +20,14 @@ from bayes3d_ros.geometry.mesh import (
     size_warning,
 )
 from bayes3d_ros.geometry.voxels import voxelize
+from bayes3d_ros.lists import first_few
 from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel, is_reserved
 from bayes3d_ros.objects.store import load_model, model_path, refuse_existing, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
 CLOSENESS = np.deg2rad(8.0)  # of two such facets, the likelihood of the one this much farther off counts e times less
+_FILES_TOLD = 5
 
 
 class MeshModel(NamedTuple):
@@ -81,6 +83,8 @@ def make_models(
     paths = [Path(path) for path in paths]
     stems: dict[str, Path] = {}
     for path in paths:
+        if path.is_dir():
+            raise MeshError(f"{path}: expected a mesh file, it is a folder{_meshes_inside(path)}")
         if not NAME_PATTERN.fullmatch(path.stem):
             raise MeshError(f"{path}: the file's stem names the object, it may hold letters, digits, '_' and '-' only")
         if is_reserved(path.stem):
@@ -100,6 +104,15 @@ def make_models(
         except MeshError as error:
             given = "" if scale == 1 else f"at --scale {scale:g} "
             raise MeshError(f"{path}: {given}{error}") from error
+
+
+def _meshes_inside(folder: Path) -> str:
+    """Names the mesh files in a folder, which were probably meant."""
+    formats = trimesh.available_formats()
+    inside = sorted(path.name for path in folder.iterdir() if path.suffix[1:].lower() in formats)
+    if not inside:
+        return ""
+    return f"; mesh files in it: {first_few(inside, _FILES_TOLD)}"
 
 
 def _was_imported(path: Path, folder: Path) -> bool:

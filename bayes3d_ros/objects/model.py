@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
+from bayes3d_ros.lists import first_few
 
 _SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
@@ -136,8 +137,7 @@ def check_types(types: Sequence[str], library: Library) -> None:
     for name in types:
         if name not in library.names:
             reserved = " (whether things may be unknown is the setting unknown)" if is_reserved(name) else ""
-            more = len(library.models) - _NAMES_TOLD
-            held = ", ".join(library.names[:_NAMES_TOLD]) + (f" and {more} more" if more > 0 else "")
+            held = first_few(library.names, _NAMES_TOLD)
             raise ValueError(f"types names {name!r}, which the library does not hold{reserved}; it holds {held}")
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayes3d_ros.lists import first_few
 from bayes3d_ros.objects.model import UNKNOWN, ObjectModel
 from bayes3d_ros.posterior.output_frame import OutputFrame
 
@@ -208,9 +209,8 @@ def usable_note(share: float) -> str:
 
 def unexplained_note(places: Sequence[UnexplainedPlace]) -> str:
     """The note for places where returns stand above the table that no surface of the scene explains."""
-    where = ", ".join(f"x {p.x:.2f} y {p.y:.2f} m ({p.pixels} pixels)" for p in places[:3])
-    more = f" and {len(places) - 3} more" if len(places) > 3 else ""
-    return f"returns above the table that belong to none of the objects, in the table's frame at {where}{more}"
+    where = first_few([f"x {p.x:.2f} y {p.y:.2f} m ({p.pixels} pixels)" for p in places], 3)
+    return f"returns above the table that belong to none of the objects, in the table's frame at {where}"
 
 
 class ParseError(Exception):

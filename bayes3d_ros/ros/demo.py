@@ -201,9 +201,10 @@ def errors(posterior: ScenePosterior, library: Library, true_poses: dict[str, np
 
 
 def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> list[str]:
-    """A line per object: type, probabilities, pose, standard deviations, distance from the truth, modes of the pose."""
+    """A line per object: type, probabilities, pose, standard deviations, mean distance of its surface from the true
+    one (ADD-S), probabilities of its modes of pose."""
     head = f"{'object':<22}{'p(type)':>8}{'p(exists)':>10}  {'camera frame: x y z, m':<23}{'orientation xyzw':<28}"
-    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'ADD-S, mm':>10}  p(mode)"]
+    lines = [head + f"{'sigma, mm':<17}{'sigma, deg':<17}{'off truth, mm':>13}  p(pose)"]
     for estimate in posterior.objects:
         sigma = np.sqrt(np.diag(estimate.covariance))
         probability = estimate.type_probabilities[estimate.type]
@@ -211,7 +212,7 @@ def scene_table(posterior: ScenePosterior, add_s_by_type: dict[str, float]) -> l
         lines.append(
             f"{estimate.type:<22}{probability:>8.3f}{estimate.probability:>10.3f}  "
             f"{spaced(estimate.position, 3):<23}{spaced(estimate.orientation, 3):<28}"
-            f"{spaced(sigma[:3] * 1e3, 2):<17}{spaced(np.degrees(sigma[3:]), 2):<17}{error:>10}  "
+            f"{spaced(sigma[:3] * 1e3, 2):<17}{spaced(np.degrees(sigma[3:]), 2):<17}{error:>13}  "
             + " ".join(f"{mode.weight:.2f}" for mode in estimate.modes[:4])
         )
     counts = ", ".join(f"{n}: {p:.3f}" for n, p in posterior.num_objects.items() if p > 5e-4)

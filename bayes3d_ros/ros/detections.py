@@ -24,7 +24,7 @@ def detections_type() -> type | None:
 
 def detection_array(posterior: ScenePosterior, library: Library, ids: Sequence[str] = ()) -> Any:
     """A detection per object, by its id; without `ids` by its label. Its results are one hypothesis per type and mode
-    of the pose given that type, with the mode's pose and covariance and the score p(exists) p(type) p(mode), by which
+    of the pose given that type, with the mode's pose and covariance and the score p(exists) p(type) p(pose), by which
     they are sorted."""
     models = library.by_name
     array = vision.Detection3DArray(header=header(posterior))

@@ -107,6 +107,14 @@ def test_a_table_that_tf_does_not_know_is_told_with_the_frames_that_it_knows(tmp
     assert known.missing == () and known.command.endswith("--table-frame base_link")
 
 
+def test_every_transform_of_tf_is_listed_once(tmp_path):
+    links = [(f"link{k}", f"link{k + 1}", 1.0, 1.0) for k in range(4)]
+    tf = [("/tf_static", transforms(*links[:3])), ("/tf_static", transforms(*links[1:]))]
+    report = bag_report(write(tmp_path / "bag", ("/cam/camera_info", info()), ("/cam/image_rect", image(START)), *tf))
+    (row,) = [row for row in report.topics if row[0] == "/tf_static"]
+    assert row[4] == "link0 -> link1, link1 -> link2, link2 -> link3, link3 -> link4"
+
+
 def test_several_depth_topics_ask_for_a_choice(tmp_path):
     topics = [("/a/depth", image(START)), ("/b/depth", image(START)), ("/a/camera_info", info())]
     report = bag_report(write(tmp_path / "bag", *topics))

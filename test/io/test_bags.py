@@ -134,6 +134,11 @@ def test_a_recording_of_sqlite_names_the_remedy_by_its_file_and_by_its_folder(tm
         read_frames(tmp_path)
 
 
+def test_a_folder_of_bags_names_them():
+    with pytest.raises(BagError, match="bags: expected an .mcap file .* in it that hold one: empty_table, .* more$"):
+        read_frames(BUNDLED)
+
+
 def test_missing_paths(tmp_path, bag):
     with pytest.raises(BagError, match="nothing: no such file or folder"):
         read_frames(tmp_path / "nothing")

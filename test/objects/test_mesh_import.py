@@ -147,6 +147,17 @@ def test_unusable_names_and_missing_files_are_refused_first(tmp_path, name, reas
     assert not (tmp_path / "library").exists()
 
 
+def test_a_folder_is_refused_with_the_meshes_in_it(tmp_path):
+    paths = [write_box(tmp_path / "meshes" / f"{name}.STL") for name in "edcbaf"]
+    (tmp_path / "meshes" / "notes.txt").write_text("none")
+    with pytest.raises(
+        MeshError, match="it is a folder; mesh files in it: a.STL, b.STL, c.STL, d.STL, e.STL and 1 more$"
+    ):
+        import_meshes([paths[0].parent], tmp_path / "library")
+    with pytest.raises(MeshError, match="it is a folder$"):
+        import_meshes([tmp_path], tmp_path / "library")
+
+
 def test_a_mesh_that_fails_leaves_the_library_as_it_was(tmp_path):
     folder = tmp_path / "library"
     import_meshes([write_box(tmp_path / "a.stl")], folder, 0.005)
