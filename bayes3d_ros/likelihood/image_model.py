@@ -63,6 +63,12 @@ def shared_errors(image: ScoredImage, errors: SharedErrorImage) -> SharedErrors:
     return SharedErrors(errors, (empty - empty.max())[None].astype(np.float32))
 
 
+def with_unknown(image: ScoredImage, errors: SharedErrorImage) -> SharedErrors:
+    """The model with unknown things allowed, whether they are in `errors` or not."""
+    amplitudes = errors.amplitudes._replace(unknown=np.bool_(True))
+    return jax.device_put(shared_errors(image, errors._replace(amplitudes=amplitudes)))
+
+
 def gain(
     model: ImageModel,
     placement: Placement,

@@ -6,6 +6,7 @@ import contextlib
 import copy
 import time
 from dataclasses import fields, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.likelihood import noise_marginal
-from bayes3d_ros.likelihood.image_model import ImageModel, image_model, sample_noise
+from bayes3d_ros.likelihood.image_model import ImageModel, image_model, sample_noise, with_unknown
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
@@ -25,10 +26,9 @@ from bayes3d_ros.parsing.best_scene import BestScene
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.explanation import explain
 from bayes3d_ros.parsing.observe import Observation, bare_table, observe
-from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
-from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
-from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture
+from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, moved_again, sampler_runs
+from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture, pooled
 from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
@@ -92,11 +92,13 @@ class SceneParser:
         if self.compiled_for(width, height):
             return
         image, errors, table = bare_table(width, height, self.settings)
-        context, model = self._context(image, errors, table)
+        models = self._context(image, errors, table)
         full = self.changed(replace(self.settings, max_objects=self.capacity))
         with contextlib.suppress(ParseError):  # a fixed number of objects is not found
-            full._sample(frame_key(0, 0), context, model)
-        full._refreshed(frame_key(0, 0), self._empty(context, model), self.capacity, context, model)
+            full._sample(frame_key(0, 0), models)
+        given = models.context, models.model, self.settings
+        moved_again(frame_key(0, 0), empty_scenes(*given, max(self.capacity, 1)), self.capacity, *given)
+        self._compiled.add(models.context.image.depth.shape)
         compile_rendering(self._arrays)
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
@@ -105,8 +107,8 @@ class SceneParser:
         start = time.perf_counter()
         settings = self.settings
         seen = observe(frame, settings)
-        context, model = self._context(seen.image, seen.errors, seen.table)
-        stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), context, model, seen)
+        models = self._context(seen.image, seen.errors, seen.table)
+        stages, ess = self._sample(frame_key(settings.seed, frame.stamp_ns), models, seen)
         samples, log_evidence, things = self._mix(stages, seen)
         summary = summarise(samples, self.types, settings.min_probability, self.library)
         scene = BestScene(samples, summary, things[summary.reference], len(self.library.names))
@@ -142,86 +144,46 @@ class SceneParser:
             table_found=seen.found,
         )
 
-    def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> tuple[Context, ImageModel]:
+    def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> "_Models":
         on_device = jax.device_put(image)
         model = image_model(image, on_device, errors, self._grid, self.settings.window)
-        return Context(on_device, self._arrays, table), model
+        closed = errors is not None and not self.settings.unknown
+        lead = with_unknown(image, errors) if closed and errors is not None else None
+        return _Models(Context(on_device, self._arrays, table), model, lead)
 
     def _sample(
-        self, key: PRNGKeyArray, context: Context, model: ImageModel, seen: Observation | None = None
+        self, key: PRNGKeyArray, models: "_Models", seen: Observation | None = None
     ) -> tuple[list[Stage], list[float]]:
         """Stages of the sampler, from the empty table to one number of known objects more than the image
-        supports."""
-        settings = self.settings
-        fixed = settings.fixed_objects >= 0
-        last = settings.fixed_objects if fixed else settings.max_objects
-        state = self._empty(context, model)
-        states: list[smc.Population] = []
-        ess, log_mass = [], [0.0]
-        for count in range(last):
-            before = state
-            state, info = smc.step(
-                jax.random.fold_in(key, count),
-                state,
-                jnp.int32(count),
-                context,
-                model,
-                self._table_size,
-                settings.window,
-                settings.ess_threshold,
-            )
-            ess.append(float(info.ess))
-            log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
-            if log_mass[-2] == max(log_mass):
-                before = self._refreshed(key, before, count, context, model)
-            states.append(before)
-            if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + LEAST_LIKELY_COUNT):
-                break
-        if log_mass[-1] == max(log_mass):
-            state = self._refreshed(key, state, len(ess), context, model)
-        return self._stages(key, [*states, state], log_mass, model, seen), ess
+        supports; and the effective fraction of each but the first, of the run that found the likeliest."""
+        runs = sampler_runs(key, *models, self.settings, max(self.capacity, 1))
+        if any(run.moved for run in runs):
+            self._compiled.add(models.context.image.depth.shape)  # the last of the slow ones
+        best = max(runs, key=lambda run: max(run.log_mass))
+        return self._stages(key, runs, models.model, seen), best.ess
 
     def _stages(
-        self,
-        key: PRNGKeyArray,
-        states: list[smc.Population],
-        log_mass: list[float],
-        model: ImageModel,
-        seen: Observation | None,
+        self, key: PRNGKeyArray, runs: list[SamplerRun], model: ImageModel, seen: Observation | None
     ) -> list[Stage]:
         """What is kept of each number of known objects: of those with negligible mass the evidence alone. Unknown
         things hardly raise a stage's mass, and lower it by thousands of nats where there is no room for them: so
         stages are looked at by falling mass, until the next one is negligible whatever its things are."""
         settings = self.settings
-        stages = [Stage.without_scenes(float(s.log_evidence), max(settings.max_objects, 1)) for s in states]
+        states = [
+            [run.states[n] for run in runs if n < len(run.states)] for n in range(max(len(r.states) for r in runs))
+        ]
+        slots = max(settings.max_objects, 1)
+        stages = [pooled([Stage.without_scenes(float(s.log_evidence), slots) for s in each]) for each in states]
+        log_mass = [stage.log_evidence + n * np.log(settings.count_ratio) for n, stage in enumerate(stages)]
         only_last = settings.fixed_objects >= 0 and not settings.knows_unknown
         best = -np.inf
         for count in [len(states) - 1] if only_last else np.argsort(-np.array(log_mass), kind="stable").tolist():
             if log_mass[count] > best + LEAST_LOG_WEIGHT:
-                stages[count] = self._keep(jax.random.fold_in(key, 1000 + count), states[count], count, model, seen)
+                keys = [jax.random.fold_in(key, 1000 * (r + 1) + count) for r in range(len(states[count]))]
+                kept = [self._keep(k, state, count, model, seen) for k, state in zip(keys, states[count], strict=True)]
+                stages[count] = pooled(kept)
                 best = max(best, stages[count].log_evidence + count * np.log(settings.count_ratio))
         return stages
-
-    def _empty(self, context: Context, model: ImageModel) -> smc.Population:
-        settings = self.settings
-        slots = max(self.capacity, 1)
-        return smc.init(context, model, settings.particles, slots, self._table_size, settings.window)
-
-    def _refreshed(
-        self, key: PRNGKeyArray, state: smc.Population, count: int, context: Context, model: ImageModel
-    ) -> smc.Population:
-        """The stage with the most likely number of objects, after some of its objects were moved by MCMC. A
-        single object is moved only with tempering: its own stage has moved it already."""
-        settings = self.settings
-        if count < fewest_moved(settings.tempering_steps):
-            return state
-        key = jax.random.fold_in(key, 2000 + count)
-        effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
-        state = smc.refresh(
-            key, state, jnp.int32(count), context, model, settings.window, settings.ess_threshold, effort
-        )
-        self._compiled.add(context.image.depth.shape)  # the last of the slow ones
-        return state
 
     def _keep(
         self, key: PRNGKeyArray, state: smc.Population, count: int, model: ImageModel, seen: Observation | None
@@ -291,6 +253,14 @@ class SceneParser:
         )
         label = np.append(0, labels).astype(np.uint16)[label]
         return scene.with_things(frame, seen, depth, label)
+
+
+class _Models(NamedTuple):
+    """What a frame is sampled under; lead: see `sampler_runs`."""
+
+    context: Context
+    model: ImageModel
+    lead: ImageModel | None
 
 
 def _of_types(arrays: LibraryArrays, library: Library, types: tuple[str, ...]) -> LibraryArrays:

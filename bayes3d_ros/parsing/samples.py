@@ -48,6 +48,27 @@ class Stage(NamedTuple):
         return cls(objects, gauss, np.zeros((0, slots), np.float32), zero, zero, zero, log_evidence, [], lineage)
 
 
+def pooled(stages: Sequence[Stage]) -> Stage:
+    """One stage of several estimates of the same one, each as likely to be right: the mean of their evidences, and
+    their scenes weighted by them."""
+    if len(stages) == 1:
+        return stages[0]
+    log_z = np.array([stage.log_evidence for stage in stages])
+    total = float(np.logaddexp.reduce(log_z))
+    share = log_z - total if np.isfinite(total) else np.full(len(stages), -np.log(len(stages)))
+    return Stage(
+        objects=jax.tree.map(lambda *parts: np.concatenate(parts), *(s.objects for s in stages)),
+        gauss=np.concatenate([s.gauss for s in stages]),
+        off=np.concatenate([s.off for s in stages]),
+        log_weight=np.concatenate([s.log_weight + own for s, own in zip(stages, share, strict=True)]),
+        p_outlier=np.concatenate([s.p_outlier for s in stages]),
+        sigma=np.concatenate([s.sigma for s in stages]),
+        log_evidence=total - float(np.log(len(stages))),
+        things=[held for s in stages for held in s.things],
+        lineage=_apart([s.lineage for s in stages]),
+    )
+
+
 def mixture(
     stages: Sequence[Stage],
     counts: Sequence[int],

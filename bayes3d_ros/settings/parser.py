@@ -201,7 +201,7 @@ class ParserSettings:
     unknown: bool = setting(
         True,
         "whether objects of no type in the library are reported: as unknown, with a box. false: every object is "
-        "taken for the best type of the library, or for outliers",
+        "taken for the best type of the library, or for outliers, and a frame takes about twice as long",
     )
     unknown_probability: float = setting(
         0.1,

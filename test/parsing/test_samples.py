@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, SENSOR_LOG_SD, TABLE_SHARE, ErrorNodes, sensor_scale
-from bayes3d_ros.parsing.samples import _along_rays, _moved, _table_bias, _to_own_rays
+from bayes3d_ros.objects.placement import Placement
+from bayes3d_ros.parsing.samples import Stage, _along_rays, _moved, _table_bias, _to_own_rays, pooled
 
 BIAS = 0.0012
 
@@ -72,3 +73,23 @@ def test_the_sensors_scale_is_its_mean_given_what_the_table_shows():
         )
         assert np.log(sensor_scale(nodes, wave)) == pytest.approx((density * log_c).sum() / density.sum(), abs=1e-6)
     assert sensor_scale(nodes, 0.0) == 1.0
+
+
+def test_two_estimates_of_a_stage_are_pooled_by_their_evidence():
+    """The mean of the evidences; expectations are those of both, weighted by the evidences. Draws are kept apart."""
+
+    def stage(log_evidence, weight, x):
+        none = np.zeros((2, 1))
+        where = Placement(none.astype(int), none.astype(int), np.array(x)[:, None], none, none)
+        things = [(), ()]
+        return Stage(where, np.zeros((2, 3, 3)), none, np.log(weight), *none.T.repeat(2, 0), log_evidence, things, none)
+
+    one, other = stage(np.log(3.0), [0.25, 0.75], [1.0, 2.0]), stage(np.log(1.0), [0.5, 0.5], [5.0, 7.0])
+    both = pooled([one, other])
+    assert both.log_evidence == pytest.approx(np.log(2.0))
+    assert np.exp(both.log_weight).sum() == pytest.approx(1.0)
+    assert np.exp(both.log_weight) @ both.objects.x[:, 0] == pytest.approx(0.75 * 1.75 + 0.25 * 6.0)
+    assert len(both.things) == 4 and both.lineage[:, 0].tolist() == [0, 0, 1, 1]
+    assert pooled([one]) is one
+    impossible = pooled([one, other._replace(log_evidence=-np.inf)])
+    assert impossible.log_evidence == pytest.approx(np.log(1.5)) and np.exp(impossible.log_weight[2:]).sum() == 0

@@ -21,6 +21,7 @@ from bayes3d_ros.likelihood.image_model import (
     sample_noise,
     shared_errors,
     with_object,
+    with_unknown,
 )
 from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scene_score import pad_scene, render_objects
@@ -39,7 +40,7 @@ from bayes3d_ros.objects.placement import Table as PriorTable
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.observe import amplitudes_of
-from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
+from bayes3d_ros.parsing.sampler_runs import sampler_runs
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
@@ -221,36 +222,27 @@ _sample_noise = jax.jit(sample_noise)
 def run_shared_sampler(
     key: PRNGKeyArray, image: ScoredImage, model: SharedErrors, problem: SharedProblem
 ) -> SharedPosterior:
-    """The posterior given an image of numpy arrays: every stage of the sampler, of weight P(n) Z_n. As `SceneParser`
-    does, it goes on from stages whose objects were not moved again, and moves those of the likeliest stage."""
-    settings = problem.settings
+    """The posterior given an image of numpy arrays: every number of objects, of weight P(n) Z_n, as `SceneParser` finds
+    them, but for numbers that it leaves out as unlikely."""
     context = Context(jax.device_put(image), problem.library, problem.table)
-    size = settings.table_width, settings.table_depth
-    effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
-    given = (context, model, size, settings.window, settings.ess_threshold)
-    state = smc.init(context, model, settings.particles, settings.max_objects, size, settings.window)
-    states, ess, log_weights = [state], [], [float(state.log_evidence) + problem.log_count[0]]
-    for number in range(1, settings.max_objects + 1):
-        state, info = smc.step(jax.random.fold_in(key, number), state, jnp.int32(number - 1), *given)
-        ess.append(float(info.ess))
-        states.append(state)
-        log_weights.append(float(state.log_evidence) + problem.log_count[number])
-        if log_weights[-1] < max(log_weights) - NEGLIGIBLE:
-            break
-    best = int(np.argmax(log_weights))
-    if best >= fewest_moved(settings.tempering_steps):  # of the likeliest stage alone, once the sampler has gone on
-        again = (context, model, settings.window, settings.ess_threshold, effort)
-        moved_key = jax.random.fold_in(key, 2000 + best)
-        states[best] = smc.refresh(moved_key, states[best], jnp.int32(best), *again)
+    lead = None if problem.settings.unknown else with_unknown(image, jax.device_get(model.image))
+    most = problem.settings.max_objects
+    runs = sampler_runs(key, context, model, lead, problem.settings, most, -NEGLIGIBLE)
+    best = max(max(run.log_mass) for run in runs)
     stages, log_mass = [], []
     margin = np.asarray(model.image.table_margin, np.float64)
-    for number, (state, log_weight) in enumerate(zip(states, log_weights, strict=True)):
-        stages.append(_kept(jax.random.fold_in(key, 1000 + number), state, number, model, log_weight))
-        negligible = log_weight < max(log_weights) - NEGLIGIBLE  # no weight is left of them
-        none = np.full(settings.particles, np.inf)
-        log_mass.append(none if negligible else log_masses(stages[-1].objects, stages[-1].number, margin, problem))
+    for number in range(most + 1):
+        told = [run for run in runs if number < len(run.states)]
+        for k, run in enumerate(told):
+            log_weight = run.log_mass[number] - float(np.log(len(told)))
+            own_key = jax.random.fold_in(key, 1000 * (k + 1) + number)
+            stages.append(_kept(own_key, run.states[number], number, model, log_weight))
+            none = np.full(problem.settings.particles, np.inf)  # no weight is left of them
+            negligible = log_weight < best - NEGLIGIBLE
+            log_mass.append(none if negligible else log_masses(stages[-1].objects, stages[-1].number, margin, problem))
     mixture: Samples = jax.tree.map(lambda *parts: np.concatenate(parts), *stages)
     weight = np.exp(mixture.weight.astype(float) - mixture.weight.max())
+    ess = max(runs, key=lambda run: max(run.log_mass)).ess
     return SharedPosterior(mixture._replace(weight=weight / weight.sum(), ess=tuple(ess)), np.concatenate(log_mass))
 
 

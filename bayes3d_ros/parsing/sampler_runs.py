@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Runs of the sampler over a frame: from the empty table to one known object more than the image supports.
+
+Where nothing unknown is allowed there are two runs. A large object may explain more returns than either of two
+neighbours whose place it takes. All particles of the first stage then hold it, and later stages can only add to it. So
+a second run has other targets on its way, in which returns in front of a scene are those of something unknown: a scene
+loses little by what it does not explain yet, and much by hiding it. Its scenes are weighted anew under the model
+(`retarget.py`). Alone it would not do: of things that no type fits it prefers to find none. Each run gives an unbiased
+estimate of Z_n, so their mean is one (`samples.py`, `pooled`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from bayes3d_ros.likelihood.image_model import ImageModel
+from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing.context import Context
+from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
+from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
+from bayes3d_ros.parsing.retarget import retargeted
+from bayes3d_ros.settings import ParserSettings
+
+_SECOND_RUN = 3000  # folded into a frame's key
+
+
+class SamplerRun(NamedTuple):
+    """Weighted scenes of 0, 1, ... known objects."""
+
+    states: list[smc.Population]
+    log_mass: list[float]  # log P(n) Z_n, up to a constant
+    ess: list[float]  # of each number of objects from 1 on, as a fraction
+    moved: bool  # whether scenes were moved again
+
+
+def sampler_runs(
+    key: PRNGKeyArray,
+    context: Context,
+    model: ImageModel,
+    lead: ImageModel | None,
+    settings: ParserSettings,
+    slots: int,
+    least_likely: float = LEAST_LIKELY_COUNT,
+) -> list[SamplerRun]:
+    """One run; and another one where a model `lead` of the same image is given, whose targets it goes through.
+
+    slots: objects that a scene has room for. least_likely: nats; a run ends at a number of objects that is this much
+    less likely than the best.
+    """
+    frame = _Frame(context, model, settings, slots, least_likely)
+    runs = [_run(key, frame, None)]
+    return runs if lead is None else [*runs, _run(jax.random.fold_in(key, _SECOND_RUN), frame, lead)]
+
+
+class _Frame(NamedTuple):
+    """What runs have in common."""
+
+    context: Context
+    model: ImageModel
+    settings: ParserSettings
+    slots: int
+    least_likely: float
+
+
+def empty_scenes(context: Context, model: ImageModel, settings: ParserSettings, slots: int) -> smc.Population:
+    """The empty table, in every particle."""
+    return smc.init(context, model, settings.particles, slots, _table_size(settings), settings.window)
+
+
+def moved_again(
+    key: PRNGKeyArray,
+    state: smc.Population,
+    count: int,
+    context: Context,
+    model: ImageModel,
+    settings: ParserSettings,
+) -> smc.Population:
+    """The stage with the most likely number of objects, after some of its objects were moved by MCMC. A single object
+    is moved only with tempering: its own stage has moved it already."""
+    if count < fewest_moved(settings.tempering_steps):
+        return state
+    key = jax.random.fold_in(key, 2000 + count)
+    effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
+    return smc.refresh(key, state, jnp.int32(count), context, model, settings.window, settings.ess_threshold, effort)
+
+
+def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRun:
+    settings = frame.settings
+    fixed = settings.fixed_objects >= 0
+    on_the_way = frame.model if lead is None else lead
+    ahead = empty_scenes(frame.context, on_the_way, settings, frame.slots)
+    state = _under_model(ahead, 0, frame, lead)
+    states: list[smc.Population] = []
+    ess, log_mass = [], [0.0]
+    for count in range(settings.fixed_objects if fixed else settings.max_objects):
+        before = state
+        ahead, info = smc.step(
+            jax.random.fold_in(key, count),
+            ahead,
+            jnp.int32(count),
+            frame.context,
+            on_the_way,
+            _table_size(settings),
+            settings.window,
+            settings.ess_threshold,
+        )
+        state = _under_model(ahead, count + 1, frame, lead)
+        ess.append(float(info.ess))
+        log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
+        if log_mass[-2] == max(log_mass):
+            before = _likeliest(key, before, count, frame)
+        states.append(before)
+        if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + frame.least_likely):
+            break
+    best = int(np.argmax(log_mass))
+    if best == len(ess):
+        state = _likeliest(key, state, best, frame)
+    return SamplerRun([*states, state], log_mass, ess, best >= fewest_moved(settings.tempering_steps))
+
+
+def _under_model(ahead: smc.Population, count: int, frame: _Frame, lead: ImageModel | None) -> smc.Population:
+    if lead is None:
+        return ahead
+    return retargeted(ahead, jnp.int32(count), frame.context, lead, frame.model, frame.settings.window)
+
+
+def _likeliest(key: PRNGKeyArray, state: smc.Population, count: int, frame: _Frame) -> smc.Population:
+    return moved_again(key, state, count, frame.context, frame.model, frame.settings)
+
+
+def _table_size(settings: ParserSettings) -> tuple[float, float]:
+    return settings.table_width, settings.table_depth
