@@ -118,7 +118,7 @@ def _object(axis: Axes, thing: StandingObject) -> None:
         _mode(axis, mode, thing, 1.0 if k == 0 else _PALE)
         if several:
             axis.annotate(
-                f"{mode.weight:.2f}", mode.centre, (11, -11 - 11 * k), textcoords="offset points", fontsize=8.5,
+                f"p(pose) {mode.weight:.2f}", mode.centre, (11, -11 - 11 * k), textcoords="offset points", fontsize=8.5,
                 color=INK if k == 0 else FAINT, zorder=8,
             )  # fmt: skip
     first = thing.modes[0]
@@ -186,7 +186,7 @@ def _object_symbols(objects: tuple[StandingObject, ...]) -> list[Artist]:
         found.append(_marker(r"$\rightarrow$", INK, "its x axis (y if x is upright); arc: 2 σ of yaw"))
     if any(len(thing.modes) > 1 for thing in objects):
         found.append(
-            Patch(fill=False, edgecolor="#aaaaaa", linestyle="--", label="pale: its other poses, with p(pose)")
+            Patch(fill=False, edgecolor="#aaaaaa", linestyle="--", label="pale: its other poses; p(pose) of each")
         )
     return found
 

@@ -131,7 +131,7 @@ def test_every_mode_is_drawn_with_its_weight_and_the_lighter_one_paler(posterior
     assert [box.get_alpha() for box in boxes] == [pytest.approx(0.45), 1.0]
     assert [box.get_linestyle() for box in boxes] == ["--", "-"]
     texts = [text.get_text() for text in axis.texts]
-    assert "0.70" in texts and "0.30" in texts
+    assert "p(pose) 0.70" in texts and "p(pose) 0.30" in texts
     assert any("its other poses" in words for words in legend)
 
 
