@@ -113,17 +113,17 @@ def _camera(axis: Axes, view: TableView, T: Float[np.ndarray, "4 4"]) -> list[Ar
 
 def _object(axis: Axes, thing: StandingObject) -> None:
     """Its modes, the heaviest one last."""
-    several = len(thing.modes) > 1
     for k, mode in reversed(list(enumerate(thing.modes))):
         _mode(axis, mode, thing, 1.0 if k == 0 else _PALE)
-        if several:
-            axis.annotate(
-                f"p(pose) {mode.weight:.2f}", mode.centre, (11, -11 - 11 * k), textcoords="offset points", fontsize=8.5,
-                color=INK if k == 0 else FAINT, zorder=8,
-            )  # fmt: skip
     first = thing.modes[0]
     corner = first.footprint[np.argmax(first.footprint @ [0.3, 1.0])] if len(first.footprint) else first.centre
     place_number(axis, corner[0], corner[1], thing.label, offset=(8, 12), unknown=thing.unknown)
+    if len(thing.modes) > 1:
+        for k, mode in enumerate(thing.modes):  # below each other, right of the object's number
+            axis.annotate(
+                f"p(pose) {mode.weight:.2f}", corner, (18, 12 - 11 * k), textcoords="offset points", fontsize=8.5,
+                color=INK if k == 0 else FAINT, zorder=8, va="center",
+            )  # fmt: skip
 
 
 def _mode(axis: Axes, mode: PlacedMode, thing: StandingObject, alpha: float) -> None:
