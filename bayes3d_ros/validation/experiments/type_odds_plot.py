@@ -15,6 +15,8 @@ from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame
 from bayes3d_ros.validation.statistics.log_odds import calibration_of_odds
 
+_PANELS = 3  # in a row, at most
+_ROOM = 1.45  # of the axis of log losses, over the largest: for the legend
 BINS = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.99, 1.0])  # of the probability of the more probable type
 
 
@@ -22,9 +24,13 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write type-odds.png: a reliability diagram an amplitude, all pairs together, and the log loss of every cell."""
     parsed = [row for row in rows if row["error"] is None]
     amplitudes = sorted({row["amplitude"] for row in parsed})
-    figure = Figure(figsize=(3.4 * (len(amplitudes) + 1), 3.6), layout="constrained", facecolor="white")
+    rows_of_panels = -(-(len(amplitudes) + 1) // _PANELS)
+    columns = -(-(len(amplitudes) + 1) // rows_of_panels)
+    figure = Figure(figsize=(3.6 * columns, 3.6 * rows_of_panels), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    *reliability, losses = np.ravel(figure.subplots(1, len(amplitudes) + 1))
+    *reliability, losses = np.ravel(figure.subplots(rows_of_panels, columns))[: len(amplitudes) + 1]
+    for axis in figure.axes[len(amplitudes) + 1 :]:
+        axis.set_visible(False)
     for axis, amplitude in zip(reliability, amplitudes, strict=True):
         _reliability(axis, np.array([row["p_true"] for row in parsed if row["amplitude"] == amplitude]), amplitude)
     _losses(losses, parsed, amplitudes)
@@ -47,7 +53,8 @@ def _reliability(axis: Axes, p_true: np.ndarray, amplitude: float) -> None:
             axis.annotate(f"{own.sum()}", (mean, right), xytext=(-5, 3), textcoords="offset points", fontsize=7,
                           ha="right", color=INK)  # fmt: skip
     axis.set(xlim=(0.48, 1.02), ylim=(-0.02, 1.04))
-    label_plot(axis, "p of the more probable type", "share right", f"errors x {amplitude:g}, {len(p_true)} frames")
+    label_plot(axis, "p of the more probable type (beside: answers)", "share right",
+               f"errors x {amplitude:g}, {len(p_true)} frames")  # fmt: skip
     open_frame(axis)
 
 
@@ -60,8 +67,8 @@ def _losses(axis: Axes, parsed: Sequence[Row], amplitudes: Sequence[float]) -> N
                 points.append((amplitude, calibration_of_odds(np.array(own)).log_loss))
         axis.plot(*zip(*points, strict=True), "o-", color=colour(k + 1), label=pair)
     axis.axhline(np.log(2), color=INK, linestyle="--", linewidth=1)
-    axis.set_ylim(bottom=0)
+    axis.set_ylim(0, _ROOM * axis.get_ylim()[1])
     label_plot(axis, "amplitude of shared errors", "nats", "log loss (dashed: a coin's)")
     open_frame(axis)
     if parsed:
-        axis.legend(fontsize=8, frameon=False)
+        axis.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
