@@ -147,8 +147,7 @@ class SceneParser:
     def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> "_Models":
         on_device = jax.device_put(image)
         model = image_model(image, on_device, errors, self._grid, self.settings.window)
-        closed = errors is not None and not self.settings.unknown
-        lead = with_unknown(image, errors) if closed and errors is not None else None
+        lead = None if errors is None or self.settings.unknown else with_unknown(image, errors)
         return _Models(Context(on_device, self._arrays, table), model, lead)
 
     def _sample(
@@ -173,7 +172,9 @@ class SceneParser:
             [run.states[n] for run in runs if n < len(run.states)] for n in range(max(len(r.states) for r in runs))
         ]
         slots = max(settings.max_objects, 1)
-        stages = [pooled([Stage.without_scenes(float(s.log_evidence), slots) for s in each]) for each in states]
+        stages = [
+            pooled([Stage.without_scenes(float(s.log_evidence), slots) for s in each], len(runs)) for each in states
+        ]
         log_mass = [stage.log_evidence + n * np.log(settings.count_ratio) for n, stage in enumerate(stages)]
         only_last = settings.fixed_objects >= 0 and not settings.knows_unknown
         best = -np.inf
@@ -181,7 +182,7 @@ class SceneParser:
             if log_mass[count] > best + LEAST_LOG_WEIGHT:
                 keys = [jax.random.fold_in(key, 1000 * (r + 1) + count) for r in range(len(states[count]))]
                 kept = [self._keep(k, state, count, model, seen) for k, state in zip(keys, states[count], strict=True)]
-                stages[count] = pooled(kept)
+                stages[count] = pooled(kept, len(runs))
                 best = max(best, stages[count].log_evidence + count * np.log(settings.count_ratio))
         return stages
 

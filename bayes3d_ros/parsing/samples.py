@@ -48,10 +48,10 @@ class Stage(NamedTuple):
         return cls(objects, gauss, np.zeros((0, slots), np.float32), zero, zero, zero, log_evidence, [], lineage)
 
 
-def pooled(stages: Sequence[Stage]) -> Stage:
-    """One stage of several estimates of the same one, each as likely to be right: the mean of their evidences, and
-    their scenes weighted by them."""
-    if len(stages) == 1:
+def pooled(stages: Sequence[Stage], runs: int) -> Stage:
+    """One stage of the estimates of several runs, each as likely to be right: the mean of their evidences, and their
+    scenes weighted by them. A run of which there is no estimate ended before, as the stage is unlikely: it counts 0."""
+    if runs == 1:
         return stages[0]
     log_z = np.array([stage.log_evidence for stage in stages])
     total = float(np.logaddexp.reduce(log_z))
@@ -63,7 +63,7 @@ def pooled(stages: Sequence[Stage]) -> Stage:
         log_weight=np.concatenate([s.log_weight + own for s, own in zip(stages, share, strict=True)]),
         p_outlier=np.concatenate([s.p_outlier for s in stages]),
         sigma=np.concatenate([s.sigma for s in stages]),
-        log_evidence=total - float(np.log(len(stages))),
+        log_evidence=total - float(np.log(runs)),
         things=[held for s in stages for held in s.things],
         lineage=_apart([s.lineage for s in stages]),
     )

@@ -85,11 +85,13 @@ def test_two_estimates_of_a_stage_are_pooled_by_their_evidence():
         return Stage(where, np.zeros((2, 3, 3)), none, np.log(weight), *none.T.repeat(2, 0), log_evidence, things, none)
 
     one, other = stage(np.log(3.0), [0.25, 0.75], [1.0, 2.0]), stage(np.log(1.0), [0.5, 0.5], [5.0, 7.0])
-    both = pooled([one, other])
+    both = pooled([one, other], 2)
     assert both.log_evidence == pytest.approx(np.log(2.0))
     assert np.exp(both.log_weight).sum() == pytest.approx(1.0)
     assert np.exp(both.log_weight) @ both.objects.x[:, 0] == pytest.approx(0.75 * 1.75 + 0.25 * 6.0)
     assert len(both.things) == 4 and both.lineage[:, 0].tolist() == [0, 0, 1, 1]
-    assert pooled([one]) is one
-    impossible = pooled([one, other._replace(log_evidence=-np.inf)])
+    assert pooled([one], 1) is one
+    ended = pooled([one], 2)  # the other run ended before
+    assert ended.log_evidence == pytest.approx(np.log(1.5)) and np.exp(ended.log_weight).sum() == pytest.approx(1.0)
+    impossible = pooled([one, other._replace(log_evidence=-np.inf)], 2)
     assert impossible.log_evidence == pytest.approx(np.log(1.5)) and np.exp(impossible.log_weight[2:]).sum() == 0

@@ -234,7 +234,7 @@ def run_shared_sampler(
     for number in range(most + 1):
         told = [run for run in runs if number < len(run.states)]
         for k, run in enumerate(told):
-            log_weight = run.log_mass[number] - float(np.log(len(told)))
+            log_weight = run.log_mass[number] - float(np.log(len(runs)))
             own_key = jax.random.fold_in(key, 1000 * (k + 1) + number)
             stages.append(_kept(own_key, run.states[number], number, model, log_weight))
             none = np.full(problem.settings.particles, np.inf)  # no weight is left of them
