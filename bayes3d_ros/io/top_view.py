@@ -121,8 +121,8 @@ def _object(axis: Axes, thing: StandingObject) -> None:
     if len(thing.modes) > 1:
         for k, mode in enumerate(thing.modes):  # below each other, right of the object's number
             axis.annotate(
-                f"p(pose) {mode.weight:.2f}", (corner[0], corner[1]), (18, 12 - 11 * k), textcoords="offset points", fontsize=8.5,
-                color=INK if k == 0 else FAINT, zorder=8, va="center",
+                f"p(pose) {mode.weight:.2f}", (corner[0], corner[1]), (18, 12 - 11 * k), textcoords="offset points",
+                fontsize=8.5, color=INK if k == 0 else FAINT, zorder=8, va="center",
             )  # fmt: skip
 
 

@@ -11,6 +11,9 @@ import math
 OVERLAP_LIMIT = 0.06  # share of a solid's volume that may lie in another: voxels and touching objects
 # The search for more objects ends at a number this much less likely than the best. The mass cut off is of second order.
 LEAST_LIKELY_COUNT = math.log(0.15)
+# Nats by which a run of the sampler may find less than the other; with more it has missed the posterior's mass, and is
+# left out (`sampler_runs.py`).
+MISSED_NATS = 7.0
 
 LEAST_THING = 4e-4  # metres^2, as the camera sees it: smaller unknown regions are outliers
 THINGS_APART = 0.02  # metres between returns of two unknown things: nearer, they are one

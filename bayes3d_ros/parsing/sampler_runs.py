@@ -6,8 +6,10 @@ Where nothing unknown is allowed there are two runs. A large object may explain 
 neighbours whose place it takes. All particles of the first stage then hold it, and later stages can only add to it. So
 a second run has other targets on its way, in which returns in front of a scene are those of something unknown: a scene
 loses little by what it does not explain yet, and much by hiding it. Its scenes are weighted anew under the model
-(`retarget.py`). Alone it would not do: of things that no type fits it prefers to find none. Each run gives an unbiased
-estimate of Z_n, so their mean is one (`samples.py`, `pooled`).
+(`retarget.py`). Alone it would not do: of things that no type fits it prefers to find none.
+
+Each run gives an unbiased estimate of Z_n, so their mean is one (`samples.py`, `pooled`). A run that finds less than
+the other by `MISSED_NATS` has missed what the other found: it is left out, since the mean would halve Z_n.
 """
 
 from typing import NamedTuple
@@ -20,7 +22,7 @@ from jaxtyping import PRNGKeyArray
 from bayes3d_ros.likelihood.image_model import ImageModel
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT
+from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT, MISSED_NATS
 from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
 from bayes3d_ros.parsing.retarget import retargeted
 from bayes3d_ros.settings import ParserSettings
@@ -46,14 +48,18 @@ def sampler_runs(
     slots: int,
     least_likely: float = LEAST_LIKELY_COUNT,
 ) -> list[SamplerRun]:
-    """One run; and another one where a model `lead` of the same image is given, whose targets it goes through.
+    """One run; and another one where a model `lead` of the same image is given, whose targets it goes through. Of two
+    runs those that have found the posterior's mass.
 
     slots: objects that a scene has room for. least_likely: nats; a run ends at a number of objects that is this much
     less likely than the best.
     """
     frame = _Frame(context, model, settings, slots, least_likely)
     runs = [_run(key, frame, None)]
-    return runs if lead is None else [*runs, _run(jax.random.fold_in(key, _SECOND_RUN), frame, lead)]
+    if lead is not None:
+        runs.append(_run(jax.random.fold_in(key, _SECOND_RUN), frame, lead))
+    best = max(max(run.log_mass) for run in runs)
+    return [run for run in runs if max(run.log_mass) >= best - MISSED_NATS]
 
 
 class _Frame(NamedTuple):

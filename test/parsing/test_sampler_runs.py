@@ -65,8 +65,9 @@ def types(state, count):
     return sorted(np.asarray(state.objects.type)[best, :count].tolist())
 
 
-def test_the_second_run_finds_neighbours_for_which_a_larger_object_stands(runs, parser):
-    first, second = runs
+def test_the_second_run_finds_neighbours_for_which_a_larger_object_stands(models, runs, parser):
+    (first,) = sampler_runs(jax.random.key(0), models.context, models.model, None, CLOSED, CLOSED.max_objects)
+    (second,) = runs  # the other one has missed them
     assert types(first.states[1], 1) == [0]  # big
     assert types(second.states[2], 2) == [1, 2]
     assert max(second.log_mass) > max(first.log_mass) + 100
@@ -85,7 +86,7 @@ def test_only_a_closed_world_has_a_second_run(parser, models):
 @pytest.mark.parametrize("count", [1, 2])
 def test_weights_under_another_model_and_back(models, runs, count):
     context, model, lead = models
-    state, number = runs[1].states[count], jnp.int32(count)
+    state, number = runs[-1].states[count], jnp.int32(count)
     same = retargeted(state, number, context, model, model, CLOSED.window)
     other = retargeted(state, number, context, model, lead, CLOSED.window)
     back = retargeted(other, number, context, lead, model, CLOSED.window)
