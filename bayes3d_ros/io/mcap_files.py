@@ -16,11 +16,10 @@ from mcap.exceptions import InvalidMagic
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from bayes3d_ros.lists import first_few
+from bayes3d_ros.lists import hint
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _REMEDY = "ros2 bag convert makes one"
-_FOLDERS_TOLD = 5
 _SQLITE = f"expected an MCAP file, it is of storage sqlite3 ({_REMEDY})"
 
 
@@ -113,10 +112,8 @@ def _files(bag: Path) -> list[Path]:
 
 def _bags_inside(folder: Path) -> str:
     """Names the folders inside that are bags: one of them was probably meant."""
-    inside = sorted({file.parent.name for file in folder.glob("*/*.mcap")})
-    if not inside:
-        return ""
-    return f"; folders in it that hold one: {first_few(inside, _FOLDERS_TOLD)}"
+    inside = {file.parent.name for file in folder.glob("*/*.mcap")}
+    return hint("folders in it that hold one", sorted(inside))
 
 
 def _messages(file: Path) -> Iterator[RawMessage]:

@@ -20,14 +20,13 @@ from bayes3d_ros.geometry.mesh import (
     size_warning,
 )
 from bayes3d_ros.geometry.voxels import voxelize
-from bayes3d_ros.lists import first_few
+from bayes3d_ros.lists import hint
 from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel, is_reserved
 from bayes3d_ros.objects.store import load_model, model_path, refuse_existing, save_model
 
 DEFAULT_VOXEL_SIZE = 0.003  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
 CLOSENESS = np.deg2rad(8.0)  # of two such facets, the likelihood of the one this much farther off counts e times less
-_FILES_TOLD = 5
 
 
 class MeshModel(NamedTuple):
@@ -109,10 +108,8 @@ def make_models(
 def _meshes_inside(folder: Path) -> str:
     """Names the mesh files in a folder, which were probably meant."""
     formats = trimesh.available_formats()
-    inside = sorted(path.name for path in folder.iterdir() if path.suffix[1:].lower() in formats)
-    if not inside:
-        return ""
-    return f"; mesh files in it: {first_few(inside, _FILES_TOLD)}"
+    inside = [path.name for path in folder.iterdir() if path.suffix[1:].lower() in formats]
+    return hint("mesh files in it", sorted(inside))
 
 
 def _was_imported(path: Path, folder: Path) -> bool:

@@ -27,7 +27,8 @@ from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.explanation import explain
 from bayes3d_ros.parsing.observe import Observation, bare_table, observe
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
-from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, moved_again, sampler_runs
+from bayes3d_ros.parsing.rejuvenation import fewest_moved
+from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, likeliest, moved_again, sampler_runs
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture, pooled
 from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
@@ -98,7 +99,6 @@ class SceneParser:
             full._sample(frame_key(0, 0), models)
         given = models.context, models.model, self.settings
         moved_again(frame_key(0, 0), empty_scenes(*given, max(self.capacity, 1)), self.capacity, *given)
-        self._compiled.add(models.context.image.depth.shape)
         compile_rendering(self._arrays)
         self._compiled.add(array_shape(width, height, self.settings.score_width))
 
@@ -156,10 +156,9 @@ class SceneParser:
         """Stages of the sampler, from the empty table to one number of known objects more than the image
         supports; and the effective fraction of each but the first, of the run that found the likeliest."""
         runs = sampler_runs(key, *models, self.settings, max(self.capacity, 1))
-        if any(run.moved for run in runs):
+        if any(run.peaks[-1] >= fewest_moved(self.settings.tempering_steps) for run in runs):
             self._compiled.add(models.context.image.depth.shape)  # the last of the slow ones
-        best = max(runs, key=lambda run: max(run.log_mass))
-        return self._stages(key, runs, models.model, seen), best.ess
+        return self._stages(key, runs, models.model, seen), likeliest(runs).ess
 
     def _stages(
         self, key: PRNGKeyArray, runs: list[SamplerRun], model: ImageModel, seen: Observation | None

@@ -12,6 +12,7 @@ Each run gives an unbiased estimate of Z_n, so their mean is one (`samples.py`, 
 the other by `MISSED_NATS` has missed what the other found: it is left out, since the mean would halve Z_n.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -36,7 +37,16 @@ class SamplerRun(NamedTuple):
     states: list[smc.Population]
     log_mass: list[float]  # log P(n) Z_n, up to a constant
     ess: list[float]  # of each number of objects from 1 on, as a fraction
-    moved: bool  # whether scenes were moved again
+
+    @property
+    def peaks(self) -> list[int]:
+        """Numbers of objects that are likelier than all smaller ones and the next; the last is the likeliest."""
+        return [n for n, mass in enumerate(self.log_mass) if mass == max(self.log_mass[: n + 2])]
+
+    @property
+    def best_log_mass(self) -> float:
+        """That of the likeliest number of objects."""
+        return max(self.log_mass)
 
 
 def sampler_runs(
@@ -55,11 +65,16 @@ def sampler_runs(
     less likely than the best.
     """
     frame = _Frame(context, model, settings, slots, least_likely)
-    runs = [_run(key, frame, None)]
-    if lead is not None:
-        runs.append(_run(jax.random.fold_in(key, _SECOND_RUN), frame, lead))
-    best = max(max(run.log_mass) for run in runs)
-    return [run for run in runs if max(run.log_mass) >= best - MISSED_NATS]
+    keys = [key] if lead is None else [key, jax.random.fold_in(key, _SECOND_RUN)]
+    runs = [_run(own, frame, target) for own, target in zip(keys, (None, lead), strict=False)]
+    best = likeliest(runs).best_log_mass
+    kept = [(own, run) for own, run in zip(keys, runs, strict=True) if run.best_log_mass >= best - MISSED_NATS]
+    return [_peaks_moved(own, run, frame) for own, run in kept]
+
+
+def likeliest(runs: Sequence[SamplerRun]) -> SamplerRun:
+    """The run that found most of the posterior's mass."""
+    return max(runs, key=lambda run: run.best_log_mass)
 
 
 class _Frame(NamedTuple):
@@ -99,11 +114,9 @@ def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRu
     fixed = settings.fixed_objects >= 0
     on_the_way = frame.model if lead is None else lead
     ahead = empty_scenes(frame.context, on_the_way, settings, frame.slots)
-    state = _under_model(ahead, 0, frame, lead)
-    states: list[smc.Population] = []
-    ess, log_mass = [], [0.0]
+    states, log_mass = [_under_model(ahead, 0, frame, lead)], [0.0]
+    ess = []
     for count in range(settings.fixed_objects if fixed else settings.max_objects):
-        before = state
         ahead, info = smc.step(
             jax.random.fold_in(key, count),
             ahead,
@@ -114,18 +127,12 @@ def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRu
             settings.window,
             settings.ess_threshold,
         )
-        state = _under_model(ahead, count + 1, frame, lead)
+        states.append(_under_model(ahead, count + 1, frame, lead))
         ess.append(float(info.ess))
-        log_mass.append(float(state.log_evidence) + (count + 1) * np.log(settings.count_ratio))
-        if log_mass[-2] == max(log_mass):
-            before = _likeliest(key, before, count, frame)
-        states.append(before)
+        log_mass.append(float(states[-1].log_evidence) + (count + 1) * np.log(settings.count_ratio))
         if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + frame.least_likely):
             break
-    best = int(np.argmax(log_mass))
-    if best == len(ess):
-        state = _likeliest(key, state, best, frame)
-    return SamplerRun([*states, state], log_mass, ess, best >= fewest_moved(settings.tempering_steps))
+    return SamplerRun(states, log_mass, ess)
 
 
 def _under_model(ahead: smc.Population, count: int, frame: _Frame, lead: ImageModel | None) -> smc.Population:
@@ -134,8 +141,12 @@ def _under_model(ahead: smc.Population, count: int, frame: _Frame, lead: ImageMo
     return retargeted(ahead, jnp.int32(count), frame.context, lead, frame.model, frame.settings.window)
 
 
-def _likeliest(key: PRNGKeyArray, state: smc.Population, count: int, frame: _Frame) -> smc.Population:
-    return moved_again(key, state, count, frame.context, frame.model, frame.settings)
+def _peaks_moved(key: PRNGKeyArray, run: SamplerRun, frame: _Frame) -> SamplerRun:
+    """The run with the scenes of its peaks moved again; the sampler itself went on from those that were not."""
+    states = list(run.states)
+    for count in run.peaks:
+        states[count] = moved_again(key, states[count], count, frame.context, frame.model, frame.settings)
+    return run._replace(states=states)
 
 
 def _table_size(settings: ParserSettings) -> tuple[float, float]:

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from fixtures.plain_tables import at, plain_frame
 from scipy.special import logsumexp
 
-from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.observe import observe
@@ -20,25 +19,15 @@ from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.parsing.retarget import retargeted
 from bayes3d_ros.parsing.sampler_runs import sampler_runs
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.simulate.ray_casting import RayCaster
 
-CAMERA = Intrinsics(200.0, 200.0, 79.5, 59.5, 160, 120)
 CLOSED = ParserSettings(particles=48, max_objects=3, table_width=0.4, table_depth=0.4, unknown=False)
 LOW, HIGH, BIG = (0.08, 0.06, 0.05), (0.08, 0.06, 0.062), (0.17, 0.06, 0.056)  # metres
 
 
 def frame():
     """Two boxes a centimetre apart, which a box as long as both covers within 6 mm; noise of 4 mm."""
-    s = np.sqrt(0.5)
-    T = np.eye(4)
-    T[:3, :3] = np.array([[1, 0, 0], [0, -s, s], [0, -s, -s]])
-    T[:3, 3] = [0, -0.6 * s, 0.6 * s]
-    boxes = [(LOW, -0.045), (HIGH, 0.045)]
-    solids = [(trimesh.creation.box(e), trimesh.transformations.translation_matrix([x, 0, e[2] / 2])) for e, x in boxes]
-    table = trimesh.creation.box((3, 3, 0.02)), trimesh.transformations.translation_matrix([0, 0, -0.01])
-    rendered = RayCaster([*solids, table]).render(T, CAMERA)
-    depth = rendered.depth + 0.004 * np.random.default_rng(0).normal(size=rendered.depth.shape)
-    return DepthFrame(depth.astype(np.float32), CAMERA, 1_700_000_000_000_000_000, "camera", T)
+    boxes = [(trimesh.creation.box(size), at(x, 0, size[2] / 2)) for size, x in ((LOW, -0.045), (HIGH, 0.045))]
+    return plain_frame(*boxes, noise=0.004)
 
 
 @pytest.fixture(scope="module")

@@ -7,18 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from fixtures.plain_tables import at, plain_frame
 
-from bayes3d_ros.geometry.camera import Intrinsics
-from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, drawn_box
 from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.validation.simulate.ray_casting import RayCaster
 
-CAMERA = Intrinsics(200.0, 200.0, 79.5, 59.5, 160, 120)
 SETTINGS = ParserSettings(particles=48, max_objects=4, table_width=0.8, table_depth=0.8)
 
 
@@ -33,31 +30,13 @@ def parser(library):
     return SceneParser(library, SETTINGS)
 
 
-def at(x, y, z, yaw=0.0):
-    T = trimesh.transformations.rotation_matrix(yaw, [0, 0, 1])
-    T[:3, 3] = x, y, z
-    return T
-
-
 BRICK = trimesh.creation.box((0.12, 0.08, 0.05)), at(-0.12, 0.02, 0.025, 0.4)
 BALL = trimesh.creation.icosphere(3, 0.045), at(0.1, 0.03, 0.045)
 
 
-def frame(*solids, seed=0):
-    """What the camera sees of solids on a table, with noise of 1 mm."""
-    s = np.sqrt(0.5)
-    T = np.eye(4)
-    T[:3, :3] = np.array([[1, 0, 0], [0, -s, s], [0, -s, -s]])
-    T[:3, 3] = [0, -0.6 * s, 0.6 * s]
-    table = trimesh.creation.box((3, 3, 0.02)), at(0, 0, -0.01)
-    rendered = RayCaster([*solids, table]).render(T, CAMERA)
-    depth = rendered.depth + 0.001 * np.random.default_rng(seed).normal(size=rendered.depth.shape)
-    return DepthFrame(depth.astype(np.float32), CAMERA, 1_700_000_000_000_000_000 + seed, "camera", T)
-
-
 @pytest.fixture(scope="module")
 def both(parser):
-    return parser.parse(frame(BRICK, BALL))
+    return parser.parse(plain_frame(BRICK, BALL))
 
 
 def test_a_known_and_an_unknown_thing(both, library):
@@ -124,18 +103,18 @@ def test_it_is_in_the_pictures(both):
 
 def test_nothing_stands_on_an_empty_table(parser):
     for seed in range(3):
-        posterior = parser.parse(frame(seed=seed))
+        posterior = parser.parse(plain_frame(seed=seed))
         assert posterior.objects == () and posterior.num_unknown[0] > 0.99
 
 
 def test_without_unknown_things_the_place_is_told(library):
-    posterior = SceneParser(library, replace(SETTINGS, unknown=False)).parse(frame(BALL))
+    posterior = SceneParser(library, replace(SETTINGS, unknown=False)).parse(plain_frame(BALL))
     assert UNKNOWN not in posterior.types and posterior.num_unknown[0] > 0.999
     assert posterior.unexplained or posterior.objects
 
 
 def test_a_fixed_number_counts_every_thing(library):
-    posterior = SceneParser(library, replace(SETTINGS, fixed_objects=2)).parse(frame(BRICK, BALL))
+    posterior = SceneParser(library, replace(SETTINGS, fixed_objects=2)).parse(plain_frame(BRICK, BALL))
     assert posterior.num_objects[2] > 0.999
     assert sorted(o.type for o in posterior.objects) == ["brick", UNKNOWN]
 
@@ -143,7 +122,7 @@ def test_a_fixed_number_counts_every_thing(library):
 def test_with_room_for_one_the_larger_thing_is_told(parser):
     """The brick gains more as a brick than the ball as something unknown, but then the ball's returns are outliers."""
     ball = trimesh.creation.icosphere(3, 0.09), at(0.1, 0.03, 0.09)
-    one = parser.changed(replace(SETTINGS, max_objects=1)).parse(frame(BRICK, ball))
+    one = parser.changed(replace(SETTINGS, max_objects=1)).parse(plain_frame(BRICK, ball))
     assert [o.type for o in one.objects] == [UNKNOWN] and one.num_objects[1] > 0.999
     assert one.log_evidence < -1000  # against things for which there is no room
     np.testing.assert_allclose(np.exp(one.samples.log_weight).sum(), 1, rtol=1e-4)
@@ -152,18 +131,18 @@ def test_with_room_for_one_the_larger_thing_is_told(parser):
 def test_what_stands_outside_the_region_is_not_told(parser):
     """Nor is it counted: the rest is as if it were not there, and nothing is compiled."""
     traces = smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
-    left = parser.changed(replace(SETTINGS, region=(-0.4, 0.0, -0.4, 0.4))).parse(frame(BRICK, BALL))
+    left = parser.changed(replace(SETTINGS, region=(-0.4, 0.0, -0.4, 0.4))).parse(plain_frame(BRICK, BALL))
     assert [o.type for o in left.objects] == ["brick"]
     assert left.num_objects[1] > 0.8 and left.num_unknown[0] > 0.99
     assert left.unexplained == () and left.warnings == ()
-    right = parser.changed(replace(SETTINGS, region=(0.0, 0.4, -0.4, 0.4))).parse(frame(BRICK, BALL))
+    right = parser.changed(replace(SETTINGS, region=(0.0, 0.4, -0.4, 0.4))).parse(plain_frame(BRICK, BALL))
     assert [o.type for o in right.objects] == [UNKNOWN]
     assert right.num_objects[1] > 0.8 and right.num_unknown[1] > 0.99
     assert (smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()) == traces
 
 
 def test_what_is_of_a_type_that_is_left_out_is_unknown(parser, library):
-    found = parser.changed(replace(SETTINGS, types=("tower",))).parse(frame(BRICK, BALL))
+    found = parser.changed(replace(SETTINGS, types=("tower",))).parse(plain_frame(BRICK, BALL))
     assert [o.type for o in found.objects] == [UNKNOWN, UNKNOWN] and found.types == (*library.names, UNKNOWN)
     assert not (found.samples.type == library.names.index("brick")).any()
 

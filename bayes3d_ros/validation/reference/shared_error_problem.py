@@ -40,7 +40,7 @@ from bayes3d_ros.objects.placement import Table as PriorTable
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.observe import amplitudes_of
-from bayes3d_ros.parsing.sampler_runs import sampler_runs
+from bayes3d_ros.parsing.sampler_runs import likeliest, sampler_runs
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
@@ -228,7 +228,7 @@ def run_shared_sampler(
     lead = None if problem.settings.unknown else with_unknown(image, jax.device_get(model.image))
     most = problem.settings.max_objects
     runs = sampler_runs(key, context, model, lead, problem.settings, most, -NEGLIGIBLE)
-    best = max(max(run.log_mass) for run in runs)
+    best = likeliest(runs)
     stages, log_mass = [], []
     margin = np.asarray(model.image.table_margin, np.float64)
     for number in range(most + 1):
@@ -238,12 +238,13 @@ def run_shared_sampler(
             own_key = jax.random.fold_in(key, 1000 * (k + 1) + number)
             stages.append(_kept(own_key, run.states[number], number, model, log_weight))
             none = np.full(problem.settings.particles, np.inf)  # no weight is left of them
-            negligible = log_weight < best - NEGLIGIBLE
+            negligible = log_weight < best.best_log_mass - NEGLIGIBLE
             log_mass.append(none if negligible else log_masses(stages[-1].objects, stages[-1].number, margin, problem))
     mixture: Samples = jax.tree.map(lambda *parts: np.concatenate(parts), *stages)
     weight = np.exp(mixture.weight.astype(float) - mixture.weight.max())
-    ess = max(runs, key=lambda run: max(run.log_mass)).ess
-    return SharedPosterior(mixture._replace(weight=weight / weight.sum(), ess=tuple(ess)), np.concatenate(log_mass))
+    return SharedPosterior(
+        mixture._replace(weight=weight / weight.sum(), ess=tuple(best.ess)), np.concatenate(log_mass)
+    )
 
 
 def _kept(key: PRNGKeyArray, state: smc.Population, number: int, model: SharedErrors, log_weight: float) -> Samples:
