@@ -5,7 +5,8 @@
 What is rendered (`slow_renderer.py` renders the same): a surface voxel is hit where the ray, having entered its cube,
 meets its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
-between planes that differ. Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
+between planes that differ. Rays are followed within the object's box only, where planes would go on past its edges.
+Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
 Most rays end within a few steps, and a few go on for dozens: after the first steps the remaining rays are packed
 together.
 """
@@ -58,6 +59,7 @@ def march(
         [library.origin[type_index, a] for a in range(3)],
         library.voxel_size[type_index],
         [[T[..., b, a] for a in range(4)] for b in range(3)],
+        [[library.box_slab[type_index, row, a] for a in range(3)] for row in range(5)],
         rays,
         near,
     )
@@ -72,11 +74,12 @@ def enter_grid(
     origin: Sequence[Array],
     size: Array,
     T_camera_object: Sequence[Sequence[Array]],
+    slab: Sequence[Sequence[Array]],
     rays: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
     near: float,
 ) -> tuple[Rays, Float[Array, "..."]]:
-    """Rays (x, y, 1) in the voxels of a grid, and where they enter it. The grid's numbers, and those of the rows of the
-    pose, broadcast against the rays."""
+    """Rays (x, y, 1) in the voxels of a grid, and where they enter the part of it that lies in the object's box. slab:
+    see `LibraryArrays.box_slab`. The grid's numbers, and those of the rows of the pose, broadcast against the rays."""
     T, axes = T_camera_object, range(3)
     eye = [(-sum(T[b][a] * T[b][3] for b in axes) - origin[a]) / size for a in axes]
     x, y = rays
@@ -84,8 +87,13 @@ def enter_grid(
     d = [jnp.where(jnp.abs(c) < 1e-6, 1e-6, c) for c in d]
     low = [-a / c for a, c in zip(eye, d, strict=True)]
     high = [(n - a) / c for n, a, c in zip(dims, eye, d, strict=True)]
+    for a in axes:
+        from_eye, along = (sum(slab[a][b] * vector[b] for b in axes) for vector in (eye, d))
+        along = jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
+        low.append((slab[3][a] - from_eye) / along)
+        high.append((slab[4][a] - from_eye) / along)
     enter, leave = jnp.minimum(low[0], high[0]), jnp.maximum(low[0], high[0])
-    for a in (1, 2):
+    for a in range(1, 6):
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
     octant = sum((c < 0).astype(jnp.int32) << bit for c, bit in zip(d, (2, 1, 0), strict=True))

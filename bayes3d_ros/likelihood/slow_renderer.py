@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The slow renderer that defines the right answer, float64: every ray against every voxel that it may enter."""
+"""The slow renderer that defines the right answer, float64: every ray against every voxel that it may enter on its way
+through the object's box."""
 
 from collections.abc import Iterator
 
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from bayes3d_ros.objects.library_arrays import INFLATION
+from bayes3d_ros.objects.library_arrays import BOX_LOOSE, INFLATION
 from bayes3d_ros.objects.model import ObjectModel
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
@@ -26,16 +27,34 @@ def render(
     eye = (-rotation.T @ T_camera_object[:3, 3] - model.origin) / model.voxel_size
     directions = rays.astype(np.float64) @ rotation / model.voxel_size
     directions = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+    way = _way_through_box(model, T_camera_object, rays)
     surface = np.zeros(model.occupancy.shape, bool)
     surface[tuple(model.surface_index.T)] = True
     depth = np.full(len(rays), np.inf)
     from_eye = model.surface_index + 0.5 - eye
     for ray, cube in _pairs(from_eye, directions):
-        np.minimum.at(depth, ray, _surface_hit(model, cube, from_eye[cube], directions[ray], near))
+        np.minimum.at(depth, ray, _surface_hit(model, cube, from_eye[cube], directions[ray], way[ray], near))
     from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
     for ray, cube in _pairs(from_eye, directions):
-        np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], near))
+        np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], way[ray], near))
     return depth
+
+
+def _way_through_box(
+    model: ObjectModel, T_camera_object: Float[np.ndarray, "4 4"], rays: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "P 2"]:
+    """Where rays enter and leave the object's box, which is grown to hold every voxel's point of the surface."""
+    axes, middle = model.T_object_box[:3, :3], model.T_object_box[:3, 3]
+    along = (model.surface_points - middle) @ axes
+    loose = BOX_LOOSE * model.voxel_size
+    low = np.minimum(along.min(0), -model.box_size / 2) - loose
+    high = np.maximum(along.max(0), model.box_size / 2) + loose
+    T_camera_box = T_camera_object.astype(np.float64) @ np.vstack([np.column_stack([axes, middle]), [0, 0, 0, 1]])
+    eye = -T_camera_box[:3, :3].T @ T_camera_box[:3, 3]
+    direction = rays.astype(np.float64) @ T_camera_box[:3, :3]
+    direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    ends = np.stack([(low - eye) / direction, (high - eye) / direction])
+    return np.stack([ends.min(0).max(-1), ends.max(0).min(-1)], -1)
 
 
 def _pairs(
@@ -61,10 +80,21 @@ def _cube(from_eye: Float[np.ndarray, "... 3"], direction: Float[np.ndarray, "..
     return ends.min(0).max(-1), ends.max(0).min(-1)
 
 
-def _interior_hit(
-    from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"], near: float
-) -> Float[np.ndarray, "N"]:
+def _within(
+    from_eye: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"], way: Float[np.ndarray, "N 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter and leave the part of a unit cube that lies on their ways."""
     enter, leave = _cube(from_eye, direction)
+    return np.maximum(enter, way[:, 0]), np.minimum(leave, way[:, 1])
+
+
+def _interior_hit(
+    from_eye: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "N 3"],
+    way: Float[np.ndarray, "N 2"],
+    near: float,
+) -> Float[np.ndarray, "N"]:
+    enter, leave = _within(from_eye, direction, way)
     return np.where((enter <= leave) & (enter > near), enter, np.inf)
 
 
@@ -73,10 +103,11 @@ def _surface_hit(
     voxel: Int[np.ndarray, "N"],
     from_eye: Float[np.ndarray, "N 3"],
     direction: Float[np.ndarray, "N 3"],
+    way: Float[np.ndarray, "N 2"],
     near: float,
 ) -> Float[np.ndarray, "N"]:
     normal = model.surface_normal[voxel]
-    enter, leave = _cube(from_eye, direction)
+    enter, leave = _within(from_eye, direction, way)
     facing = (normal * direction).sum(-1)
     facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
     offset = model.surface_offset[voxel] / model.voxel_size

@@ -19,6 +19,7 @@ from bayes3d_ros.objects.self_symmetry import self_symmetry
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
 INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
+BOX_LOOSE = 0.02  # voxels that rays are met beyond the object's box, in which faces lie
 SURFACE_SAMPLES = 96  # of a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
@@ -40,6 +41,7 @@ class LibraryArrays(NamedTuple):
     dims: Int[Array, "K 3"]
     voxel_size: Float[Array, "K"]
     origin: Float[Array, "K 3"]
+    box_slab: Float[Array, "K 5 3"]  # the object's box, which cuts its planes off (`_box_slab`)
     T_contact_object: Float[Array, "K 6 4 4"]  # face down, box centre above the origin, resting on z = 0
     face_size: Float[Array, "K 6 2"]  # width and height of the contact face, metres
     hull_corner: Float[Array, "K 3 C"]  # of a convex solid around all that rays meet (`hull.py`), object frame
@@ -135,6 +137,7 @@ def library_arrays(library: Library) -> LibraryArrays:
         dims=stack([np.array(m.occupancy.shape) for m in models], np.int32),
         voxel_size=stack([np.float32(m.voxel_size) for m in models]),
         origin=stack([m.origin for m in models]),
+        box_slab=stack([_box_slab(m) for m in models]),
         T_contact_object=stack(T_contact_object),
         face_size=stack([np.stack([face_size(m, f) for f in range(NUM_FACES)]) for m in models]),
         hull_corner=stack([np.pad(h, ((0, MOST_CORNERS - len(h)), (0, 0)), "edge").T for h in hulls]),
@@ -153,6 +156,18 @@ def library_arrays(library: Library) -> LibraryArrays:
 def possible_first(library: LibraryArrays) -> tuple[Int[Array, "K"], Int[Array, ""]]:
     """All types, those that the prior allows before the others; and how many the former are."""
     return jnp.argsort(~library.possible, stable=True), library.possible.sum()
+
+
+def _box_slab(model: ObjectModel) -> Float[np.ndarray, "5 3"]:
+    """The box around an object, for a point q in voxels of its grid: where the first three rows times q lie between the
+    last two, metres. Planes go on to the ends of their voxels; where sides meet at an edge they would go past it."""
+    axes = model.T_object_box[:3, :3].T
+    along = np.concatenate([model.surface_points @ axes.T, [axes @ model.T_object_box[:3, 3]]])
+    middle, half = along[-1], model.box_size / 2
+    loose = BOX_LOOSE * model.voxel_size
+    low, high = np.minimum(middle - half, along.min(0)) - loose, np.maximum(middle + half, along.max(0)) + loose
+    first = axes @ model.origin
+    return np.concatenate([axes * model.voxel_size, [low - first, high - first]])
 
 
 def _solid(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:

@@ -76,7 +76,8 @@ def test_like_the_reference(cast, library, type_id):
         hit &= np.isfinite(fast)
         away.append((fast[hit] - slow[hit]) / model.voxel_size)
     away = np.concatenate(away)
-    assert away.min() > -2e-4  # voxels; measured, of the worst of the types: -1.0e-4
+    # Voxels; measured, of the worst of the types: -1.2e-3, as rounded planes make the reference's box a little smaller.
+    assert away.min() > -2e-3
     assert np.mean(away) < 0.03  # 0.015
     assert np.mean(away > 0.1) < 0.05  # 0.041
     assert np.quantile(away, 0.99) < 0.4  # 0.32
@@ -139,6 +140,26 @@ def test_planes(cast, library, face):
         assert inside.sum() > 100
         error = np.abs(depth[inside] - expected[inside]) / model.voxel_size
         assert error.max() < 0.02 and np.quantile(error, 0.9) < 0.01
+
+
+def test_outlines_of_a_box(cast, library):
+    """A box is seen as large as it is. Without the cut at its box, planes that go on to the ends of their voxels make
+    it up to 5 % larger."""
+    model, half = library.models[1], np.array([0.06, 0.09, 0.12]) / 2
+    x, y = pixel_rays(200, 700.0)
+    rays = np.stack([x, y, np.ones_like(x)], -1)
+    larger = []
+    for seed in range(6):
+        pose = random_pose(np.random.default_rng(seed), (0, 0, 0.7), (0, 0, 0.7))
+        eye, direction = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+        ends = np.stack([(-half - eye) / direction, (half - eye) / direction])
+        exact = ends.min(0).max(-1) < ends.max(0).min(-1)
+        seen = np.isfinite(cast(1, pose, x, y))
+        rim = (exact ^ np.roll(exact, 1, 0)).sum() + (exact ^ np.roll(exact, 1, 1)).sum()
+        pixel = 0.7 / 700.0 / model.voxel_size  # in voxels
+        larger.append([(seen & ~exact).sum() / rim * pixel, (exact & ~seen).sum() / rim * pixel])
+    beyond, missing = np.max(larger, 0)
+    assert beyond < 0.02 and missing < 0.07  # voxels, of the rim; measured 0.015 and 0.053
 
 
 def test_objects_broadcast(cast, library):

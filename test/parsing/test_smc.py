@@ -75,7 +75,7 @@ def enumerate_evidence(context, grid, empty):
     cells = cells[(np.abs(cells[:, 1:3]) < 0.19).all(-1)]  # no face is narrower: beyond, there is no prior
     value, rest, totals = evaluate(cells), -np.inf, []
     # Nats of the best, and most cells: the smaller the cells, the better their middles stand for them.
-    for within, most in ((1500, 40), (800, 40), (300, 50), (100, 60), (16, 1500)):
+    for within, most in ((1500, 40), (800, 40), (300, 50), (100, 60), (30, 600), (16, 1500)):
         keep = value > max(value.max() - within, np.sort(value)[-min(most, len(value))])
         rest = np.logaddexp(rest, logsumexp(value[~keep]) + np.log(width.prod()))
         cells = np.repeat(cells[keep], 27, 0)

@@ -76,7 +76,7 @@ class Things(NamedTuple):
     words: Int[np.ndarray, "V"]
     first: Int[np.ndarray, "T"]
     dims: Int[np.ndarray, "T*3"]
-    origin: Float[np.ndarray, "T*3"]
+    origin: Float[np.ndarray, "T*18"]  # of the grid, then its `box_slab`
     size: Float[np.ndarray, "T"]
     type_id: Int[np.ndarray, "N*K"]
     hull_corner: Float[np.ndarray, "T*3*C"]
@@ -105,7 +105,8 @@ class Space(NamedTuple):
 
     lanes: Lanes
     met: Met
-    turn: Float[np.ndarray, "9"]
+    turn: Float[np.ndarray, "9"]  # from the camera to an object's grid
+    slab: Float[np.ndarray, "15"]  # its box before the camera
     corner_u: Float[np.ndarray, "C"]  # of one object's hull, in the image
     corner_v: Float[np.ndarray, "C"]
     sides: Float[np.ndarray, "K*20"]  # ends of every object's u + slope v, and u - slope v
@@ -167,6 +168,7 @@ def new_space(height, width, border, objects, corners):
         _new_lanes(RAYS_SIDE_BY_SIDE + 2 * VECTOR_LANES),
         Met(np.empty(room, np.float32), np.empty(room, np.int32)),
         np.empty(9, np.float32),
+        np.empty(15, np.float32),
         np.empty(corners, np.float32),
         np.empty(corners, np.float32),
         np.empty(OUTLINE_SIDES * objects, np.float32),

@@ -122,7 +122,7 @@ def _things(hypotheses: RenderedHypotheses, library: LibraryArrays) -> tuple[Arr
         _whole(library.words),
         _whole(library.first),
         _whole(library.dims),
-        _real(library.origin),
+        _real(jnp.concatenate([library.origin[:, None], library.box_slab], 1)),
         _real(library.voxel_size),
         _whole(hypotheses.type),
         _real(library.hull_corner),

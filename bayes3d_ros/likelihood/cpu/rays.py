@@ -40,8 +40,30 @@ def _cell(eye, d, at, n):
 
 
 @fast
-def _enter(grid, turn, lanes, first, last):
-    """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the grid."""
+def _place_slab(grid, origin, turn, slab):
+    """The object's box before the camera, written to `slab`: as for `turn`, what the camera's axis b adds along the
+    box's axis a; and where the box begins and ends along its axes from the eye, metres."""
+    for a in range(3):
+        one, two, three = origin[3 + 3 * a], origin[4 + 3 * a], origin[5 + 3 * a]
+        for b in range(3):
+            slab[3 * b + a] = one * turn[3 * b] + two * turn[3 * b + 1] + three * turn[3 * b + 2]
+        from_eye = one * grid.eye_x + two * grid.eye_y + three * grid.eye_z
+        slab[9 + a], slab[12 + a] = origin[12 + a] - from_eye, origin[15 + a] - from_eye
+
+
+@inlined
+def _between(slab, x, y, axis):
+    """Where a ray enters and leaves the object's box along one of its axes."""
+    along = slab[axis] * x + slab[3 + axis] * y + slab[6 + axis]
+    over = f32(1.0) / (f32(1e-9) if abs(along) < f32(1e-9) else along)
+    low, high = slab[9 + axis] * over, slab[12 + axis] * over
+    return min(low, high), max(low, high)
+
+
+@fast
+def _enter(grid, turn, slab, lanes, first, last):
+    """Where rays (x, y, 1) in the camera, which their lanes hold as x and y, enter and leave the part of the grid that
+    lies in the object's box."""
     tiny, zero = f32(1e-6), f32(0.0)
     dx, dy, dz, t, leave = lanes.x, lanes.y, lanes.z, lanes.t, lanes.leave
     for k in range(u64(first), u64(last)):
@@ -57,7 +79,14 @@ def _enter(grid, turn, lanes, first, last):
         low_b, high_b = (zero - grid.eye_y) * ib, (grid.ny - grid.eye_y) * ib
         low_c, high_c = (zero - grid.eye_z) * ic, (grid.nz - grid.eye_z) * ic
         enter = max(min(low_a, high_a), max(min(low_b, high_b), min(low_c, high_c)))
-        leave[k] = min(max(low_a, high_a), min(max(low_b, high_b), max(low_c, high_c)))
+        end = min(max(low_a, high_a), min(max(low_b, high_b), max(low_c, high_c)))
+        (in_a, out_a), (in_b, out_b), (in_c, out_c) = (
+            _between(slab, x, y, 0),
+            _between(slab, x, y, 1),
+            _between(slab, x, y, 2),
+        )
+        enter = max(enter, max(in_a, max(in_b, in_c)))
+        leave[k] = min(end, min(out_a, min(out_b, out_c)))
         dx[k], dy[k], dz[k] = a, b, c
         t[k] = max(enter, f32(NEAREST_HIT)) + f32(NUDGE) * min(abs(ia), min(abs(ib), abs(ic)))
 
@@ -184,7 +213,7 @@ def render_object(things, thing, k, picture, patch, stride, shift, space):
         space.turn,
         space.lanes,
     )
-    origin, dims = things.origin[3 * type_id : 3 * type_id + 3], things.dims[3 * type_id : 3 * type_id + 3]
+    origin, dims = things.origin[18 * type_id : 18 * type_id + 18], things.dims[3 * type_id : 3 * type_id + 3]
     u0, u1, v0, v1 = space.box[4 * k], space.box[4 * k + 1], space.box[4 * k + 2], space.box[4 * k + 3]
     if u1 <= u0:
         return
@@ -213,6 +242,8 @@ def render_object(things, thing, k, picture, patch, stride, shift, space):
         _eye(pose, origin, 1) * scale,
         _eye(pose, origin, 2) * scale,
     )
+    slab = space.slab
+    _place_slab(grid, origin, turn, slab)
     entered, used = 0, 0
     for v in range(v0, v1):
         first = max(int(np.ceil(max(space.left[v], f32(u0)) - f32(ROUNDING))), u0)
@@ -222,13 +253,13 @@ def render_object(things, thing, k, picture, patch, stride, shift, space):
             _place_rays(picture.ray_x, first, some, picture.ray_y[v], v * stride + shift + first, lanes, used)
             first, used = first + some, used + some
             if used == RAYS_SIDE_BY_SIDE:
-                _enter(grid, turn, lanes, entered, used)
+                _enter(grid, turn, slab, lanes, entered, used)
                 entered = used = _walk(
                     things.words, grid, lanes, used, RAYS_SIDE_BY_SIDE - _ROOM_RAYS, space.met, patch
                 )
     for lane in range(used, whole_vectors(used)):  # or they would grow each time that they enter
         lanes.x[lane] = lanes.y[lane] = f32(0.0)
-    _enter(grid, turn, lanes, entered, whole_vectors(used))
+    _enter(grid, turn, slab, lanes, entered, whole_vectors(used))
     _walk(things.words, grid, lanes, used, 0, space.met, patch)
 
 

@@ -36,6 +36,7 @@ class RayInputs(NamedTuple):
     first: Any  # K types
     dims: Any  # 3 a type
     origin: Any  # 3 a type
+    slab: Any  # 15 a type
     size: Any
     type: Any  # of every object of every hypothesis
     pose: Any  # 12 each
@@ -51,6 +52,7 @@ def ray_inputs(hypotheses: RenderedHypotheses, image: ScoredImage, library: Libr
         first=library.first,
         dims=library.dims.astype(jnp.float32).ravel(),
         origin=library.origin.ravel(),
+        slab=library.box_slab.ravel(),
         size=library.voxel_size,
         type=hypotheses.type.ravel(),
         pose=hypotheses.T_camera_object[..., :3, :].ravel(),
@@ -81,6 +83,7 @@ def depth_of_rays(
             [given.origin[3 * type_id + a] for a in range(3)],
             given.size[type_id],
             [[given.pose[12 * thing + 4 * b + a] for a in range(4)] for b in range(3)],
+            [[given.slab[15 * type_id + 3 * row + a] for a in range(3)] for row in range(5)],
             (x, y),
             NEAREST_HIT,
         )
