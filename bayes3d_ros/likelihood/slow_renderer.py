@@ -53,8 +53,7 @@ def _way_through_box(
     eye = -T_camera_box[:3, :3].T @ T_camera_box[:3, 3]
     direction = rays.astype(np.float64) @ T_camera_box[:3, :3]
     direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    ends = np.stack([(low - eye) / direction, (high - eye) / direction])
-    return np.stack([ends.min(0).max(-1), ends.max(0).min(-1)], -1)
+    return np.stack(_between(low - eye, high - eye, direction), -1)
 
 
 def _pairs(
@@ -76,7 +75,14 @@ def _pairs(
 
 def _cube(from_eye: Float[np.ndarray, "... 3"], direction: Float[np.ndarray, "... 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Where a ray enters and leaves a unit cube."""
-    ends = np.stack([(from_eye - 0.5) / direction, (from_eye + 0.5) / direction])
+    return _between(from_eye - 0.5, from_eye + 0.5, direction)
+
+
+def _between(
+    low: Float[np.ndarray, "... 3"], high: Float[np.ndarray, "... 3"], direction: Float[np.ndarray, "... 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a ray enters and leaves a box along the axes, whose ends are given from the eye."""
+    ends = np.stack([low / direction, high / direction])
     return ends.min(0).max(-1), ends.max(0).min(-1)
 
 

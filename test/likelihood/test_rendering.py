@@ -76,8 +76,8 @@ def test_like_the_reference(cast, library, type_id):
         hit &= np.isfinite(fast)
         away.append((fast[hit] - slow[hit]) / model.voxel_size)
     away = np.concatenate(away)
-    # Voxels; measured, of the worst of the types: -1.2e-3, as rounded planes make the reference's box a little smaller.
-    assert away.min() > -2e-3
+    # Voxels; measured, of the worst of the types: -1.0e-4. One ray of a box grazes a plane at its edge: -1.2e-3.
+    assert np.sort(away)[1] > -2e-4 and away.min() > -2e-3
     assert np.mean(away) < 0.03  # 0.015
     assert np.mean(away > 0.1) < 0.05  # 0.041
     assert np.quantile(away, 0.99) < 0.4  # 0.32
