@@ -28,6 +28,9 @@ HERMITE = (np.array([-(3**0.5), 0.0, 3**0.5]), np.array([1 / 6, 2 / 3, 1 / 6]))
 # tables (0.63, standard deviation of its log 0.15; twice and three times the errors 1.24 and 1.83).
 TABLE_SHARE = 0.63
 SENSOR_LOG_SD = 0.2  # of tau about what the sensor's other errors say
+# Least curvature of the log likelihood of a cell's offset at its mode, as a share of what the curvature would be if it
+# were known which returns are outliers. A peak that is flatter than that at its top is steeper beside it.
+LEAST_CURVATURE = 0.5
 _PAIRS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # standard deviations of log sigma, logit p_out
 _STANDING = 0.008  # metres in front of the table from which returns that touch are an object's
 _LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
@@ -54,6 +57,15 @@ class TableErrors(NamedTuple):
 
     mean: Float[np.ndarray, "3"]
     sd: Float[np.ndarray, "3"]
+
+
+class _Inliers(NamedTuple):
+    """Which returns are no outliers, and what they say about their cell's offset."""
+
+    share: Float[np.ndarray, "C K"]  # probability of no outlier, given the offset
+    off2: Float[np.ndarray, "C K"]  # squares of (return - offset), in standard deviations of a return
+    weight: Float[np.ndarray, "C K"]  # 1 / metres^2
+    curvature: Float[np.ndarray, "C"]  # 1 / metres^2, of the log likelihood of the offset
 
 
 class _TableCells(NamedTuple):
@@ -116,19 +128,15 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
     mean = np.maximum(np.log([1.4826 * np.nanmedian(np.abs(scaled - middle)) + 1e-9, 0.01, max(wave, 1e-9)]), least)
     offset = np.nanmedian(np.where(cells.real, cells.residual, np.nan), 1)
     for _ in range(_STEPS):
-        sigma, p, table = np.exp(mean[0]), 1 / (1 + np.exp(-mean[1])), np.exp(mean[2])
+        sigma, table = np.exp(mean[0]), np.exp(mean[2])
         tie = table**-2 if wave > 0 else 1e16
-        off2 = np.square(cells.residual - offset[:, None]) * cells.precision / sigma**2
-        inlier = (1 - p) * np.exp(-0.5 * off2) * np.sqrt(cells.precision / (2 * np.pi)) / sigma
-        share = np.where(cells.real, inlier / (inlier + p * cells.outlier), 0.0)
-        weight = share * cells.precision / sigma**2
-        told = weight.sum(1)
-        offset, variance = (weight * cells.residual).sum(1) / (told + tie), 1 / (told + tie)
+        of = _inliers(cells, offset, sigma, 1 / (1 + np.exp(-mean[1])))
+        offset, variance = (of.weight * cells.residual).sum(1) / (of.weight.sum(1) + tie), 1 / (of.curvature + tie)
         tied = 1 - variance * tie  # share of each cell's offset that its returns determine
         of_table = 2 * np.square(tied).sum() + AMPLITUDE_LOG_SD**-2
-        inliers, returns = share.sum(), cells.real.sum()
-        square = np.square(cells.residual - offset[:, None]) + variance[:, None]
-        mean[0] = 0.5 * np.log((share * cells.precision * square).sum() / inliers)
+        inliers, squares = _expected(of, variance[:, None] * cells.precision / sigma**2)
+        returns = cells.real.sum()
+        mean[0] += 0.5 * np.log(squares / inliers)
         mean[1] = np.log((returns - inliers + 1) / (inliers + 1))
         if wave > 0:
             # A step of Newton's on the log posterior of log tau, whose information the offsets' own is not part of.
@@ -137,11 +145,30 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
             mean[2] += np.clip(pull / of_table, -0.5, 0.5)
         mean = np.clip(mean, least, np.log([sigma_max, 1e5, 1.0]))
     # Louis' formula (1982): information of complete data, minus the variance due to not knowing which are outliers.
-    unsure = share * (1 - share)
-    of_sigma = 2 * (inliers - tied.sum()) - (unsure * np.square(off2 - 1)).sum()
+    unsure = of.share * (1 - of.share)
+    of_sigma = 2 * (inliers - tied.sum()) - (unsure * np.square(of.off2 - 1)).sum()
     of_p = (returns - inliers) * inliers / returns - unsure.sum()
     information = [of_sigma, max(of_p, 1.0), of_table]
     return TableErrors(mean, np.minimum(np.maximum(information, 1e-9) ** -0.5, _WIDEST))
+
+
+def _inliers(cells: _TableCells, offset: Float[np.ndarray, "C"], sigma: float, p: float) -> _Inliers:
+    """offset, sigma: metres."""
+    off2 = np.square(cells.residual - offset[:, None]) * cells.precision / sigma**2
+    inlier = (1 - p) * np.exp(-0.5 * off2) * np.sqrt(cells.precision / (2 * np.pi)) / sigma
+    share = np.where(cells.real, inlier / (inlier + p * cells.outlier), 0.0)
+    weight = share * cells.precision / sigma**2
+    told, unsure = weight.sum(1), ((1 - share) * weight * off2).sum(1)
+    return _Inliers(share, off2, weight, np.maximum(told - unsure, LEAST_CURVATURE * told))
+
+
+def _expected(of: _Inliers, variance: Float[np.ndarray, "C K"]) -> tuple[float, float]:
+    """Mean number of inliers, and of their squares `off2`, over offsets of this variance (in variances of a return): to
+    its first power."""
+    share, off2, unsure = of.share, of.off2, of.share * (1 - of.share)
+    inliers = share + 0.5 * variance * unsure * ((1 - 2 * share) * off2 - 1)
+    squares = share * (off2 + variance) + 0.5 * variance * unsure * ((1 - 2 * share) * off2**2 - 5 * off2)
+    return inliers.sum(), squares.sum()
 
 
 def _table_cells(image: ScoredImage, inside, spread, block: int) -> _TableCells:

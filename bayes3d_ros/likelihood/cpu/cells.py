@@ -15,6 +15,7 @@ from bayes3d_ros.likelihood.cpu.buffers import f32, u64
 from bayes3d_ros.likelihood.cpu.compiling import allocating, fast, inlined, strict
 from bayes3d_ros.likelihood.cpu.packing import larger
 from bayes3d_ros.likelihood.cpu.windows import exp, log
+from bayes3d_ros.likelihood.error_nodes import LEAST_CURVATURE
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
     FEWEST_INLIERS,
@@ -138,9 +139,11 @@ def _look(batch, returns, at, sigma):
     w = u64(CELLS_SIDE_BY_SIDE)
     place, height, weight, inliers, product = batch.place, batch.height, batch.curvature, batch.inliers, batch.product
     residual, precision, root, none, peak = batch.residual, batch.precision, batch.root, batch.none, batch.peak
-    at, scale, certain = u64(at), f32(-0.5) / (sigma * sigma), f32(1.0) / (sigma * sigma)
+    unsure, at = batch.pull, u64(at)
+    scale, certain = f32(-0.5) / (sigma * sigma), f32(1.0) / (sigma * sigma)
     for c in range(w):
         height[at + c], weight[at + c], inliers[at + c], product[c] = f32(0.0), f32(0.0), f32(0.0), f32(1.0)
+        unsure[c] = f32(0.0)
     for slot in range(returns):
         first, last = u64(slot) * w, slot % RETURNS_A_LOG == RETURNS_A_LOG - 1 or slot == returns - 1
         for c in range(w):
@@ -151,13 +154,15 @@ def _look(batch, returns, at, sigma):
             share = inlier / total
             product[c] *= total if root[first + c] > f32(0.0) else f32(1.0)
             weight[at + c] += share * iv
+            unsure[c] += share * (f32(1.0) - share) * iv * iv * off * off
             inliers[at + c] += share
         if last:
             for c in range(w):
                 height[at + c] += log(product[c])
                 product[c] = f32(1.0)
     for c in range(w):
-        weight[at + c] *= certain
+        told = weight[at + c]
+        weight[at + c] = larger(told - unsure[c] * certain, f32(LEAST_CURVATURE) * told) * certain
 
 
 @strict

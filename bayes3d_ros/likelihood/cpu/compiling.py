@@ -36,6 +36,7 @@ COMPILES = "BAYES3D_COMPILES_HERE"  # environment variable: this process compile
 SOURCES = (
     "likelihood/cpu/*.py",
     "likelihood/density.py",
+    "likelihood/error_nodes.py",
     "likelihood/march.py",
     "likelihood/shared_errors.py",
     "likelihood/tiles.py",
