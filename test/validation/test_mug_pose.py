@@ -164,6 +164,9 @@ def test_summary_lines_and_picture(tmp_path):
     assert mug_pose.summary(rows)["network_needs"] == {"as trained": None}
     paths = mug_pose.plot(rows, tmp_path)
     assert [path.suffix for path in paths] == [".pdf", ".png"] and all(path.stat().st_size > 1000 for path in paths)
+    rows[0] |= {"looks": [[50, 1.0, 1.1], [100, 0.8, 0.9]], "steps": 100, "validation_loss": 0.9}
+    names = [path.name for path in mug_pose.plot(rows, tmp_path)]
+    assert names[2:] == ["mug-pose-training.pdf", "mug-pose-training.png"]
     assert "mesh" in mug_pose.line(rows[-1]) and mug_pose.plot([], tmp_path) == []
 
 

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import optax
 
 from bayes3d_ros.validation.networks import installed, training, von_mises
+from bayes3d_ros.validation.networks.augmentation import Augmentation, augmented
 from bayes3d_ros.validation.networks.depth_input import DepthScale
 from bayes3d_ros.validation.networks.models import DepthNetwork, NetworkPlan, file_bytes, parameter_count
+from bayes3d_ros.validation.networks.variants import Variant, predictions_of, train_variant, training_told
 
 PLAN = NetworkPlan((4, 8), (16,))
 QUICK = training.TrainingPlan(rates=(3e-3, 1e-2), batch=16, most_steps=60, check_every=10, patience=3)
@@ -28,6 +30,14 @@ def test_a_von_mises_density_integrates_to_one_and_is_scipys(concentration):
     assert np.trapezoid(np.exp(q.log_density(angles)), angles) == pytest.approx(1, abs=1e-9)
     if concentration:
         np.testing.assert_allclose(q.log_density(angles), vonmises(concentration, 1.2).logpdf(angles), atol=1e-8)
+
+
+def test_a_mixture_is_the_mean_density_of_its_members():
+    members = von_mises.VonMises(1.0, 20.0), von_mises.VonMises(-2.0, 3.0)
+    angles = np.linspace(-np.pi, np.pi, 9)
+    mean = np.mean([np.exp(one.log_density(angles)) for one in members], axis=0)
+    np.testing.assert_allclose(np.exp(von_mises.Mixture(members).log_density(angles)), mean, rtol=1e-12)
+    np.testing.assert_allclose(von_mises.Mixture(members[:1]).log_density(angles), members[0].log_density(angles))
 
 
 @pytest.mark.parametrize("concentration", [0.3, 4.0, 200.0])
@@ -65,6 +75,42 @@ def test_missing_returns_have_a_channel_of_their_own():
 
 
 @pytest.fixture
+def pictures():
+    """Inputs whose depth tells row and column, with a return lost here and there."""
+    depth = 0.01 * np.arange(12)[:, None] + 0.0003 * np.arange(15)
+    depth = np.repeat(depth[None], 40, 0)
+    depth[:, 5, 7] = np.nan
+    return DepthScale(0.0, 1.0).as_input(depth)
+
+
+def test_augmentation_of_no_size_changes_nothing(pictures):
+    same = augmented(pictures, Augmentation(0, 0.0, 0.0, 0.0), np.random.default_rng(0))
+    np.testing.assert_array_equal(same, pictures)
+
+
+def test_augmentation_shifts_whole_images_with_their_lost_returns(pictures):
+    moved = augmented(pictures, Augmentation(2, 0.0, 0.0, 0.0), np.random.default_rng(0))
+    lost = np.argwhere(moved[:, 1] == 1)
+    assert len(lost) == len(pictures) and set(lost[:, 1]) == set(range(3, 8)) and set(lost[:, 2]) == set(range(5, 10))
+    for k, v, u in lost:
+        inside = moved[k, :, 2:-2, 2:-2]
+        np.testing.assert_array_equal(inside, pictures[k, :, 7 - v : 15 - v, 9 - u : 20 - u])
+
+
+def test_augmentation_changes_depths_as_it_says(pictures):
+    rng = np.random.default_rng(0)
+    returned = pictures[0, 1] == 0
+    off = (augmented(pictures, Augmentation(0, 0.1, 0.0, 0.0), rng) - pictures)[:, 0, returned]
+    assert np.ptp(off, axis=1).max() < 1e-6 and 0.06 < off[:, 0].std() < 0.14
+    noise = (augmented(pictures, Augmentation(0, 0.0, 0.1, 0.0), rng) - pictures)[:, 0, returned].std(1)
+    assert noise.min() < 0.02 and 0.08 < noise.max() < 0.115
+    lost = augmented(pictures, Augmentation(0, 0.0, 0.0, 0.5), rng)
+    share = lost[:, 1].mean((1, 2))
+    assert share.min() < 0.1 and 0.35 < share.max() < 0.6 and (lost[:, 1, 5, 7] == 1).all()
+    assert (lost[:, 0][lost[:, 1] == 1] == 0).all()
+
+
+@pytest.fixture
 def halves():
     """Images of which the left or the right half is nearer, and which."""
     rng = np.random.default_rng(0)
@@ -86,6 +132,36 @@ def test_training_learns_what_can_be_learned_and_is_repeatable(halves):
     said = training.predictions(trained.network, images)
     assert said.shape == (40, 2) and (said.argmax(1) == side).all()
     np.testing.assert_array_equal(said[:3], training.predictions(trained.network, images[:3]))
+
+
+def test_looks_tell_how_the_losses_fell(halves):
+    images, side = halves
+    network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
+    loss = optax.softmax_cross_entropy_with_integer_labels
+    trained = training.train_best(network, images, side, loss, QUICK, seed=3)
+    assert [look.step for look in trained.looks] == list(range(10, 10 * len(trained.looks) + 1, 10))
+    assert trained.looks[0].training_loss > 0.3 > trained.looks[-1].training_loss
+    assert min(look.validation_loss for look in trained.looks) == trained.validation_loss
+
+
+def test_an_ensemble_has_members_of_its_own_and_augmentation_other_images(halves):
+    images, side = halves
+    loss = optax.softmax_cross_entropy_with_integer_labels
+    short = QUICK._replace(most_steps=20)
+
+    def trained(variant):
+        return train_variant(variant, images, side, 2, loss, short, seed=1)
+
+    (plain,), members = trained(Variant(PLAN)), trained(Variant(PLAN, members=3))
+    said = predictions_of(members, images)
+    assert said.shape == (3, 40, 2) and np.abs(said[0] - said[1]).max() > 0.1
+    np.testing.assert_array_equal(said[0], predictions_of([plain], images)[0])
+    told, of_one = training_told(members), training_told([plain])
+    for key in ("parameters", "file_bytes", "memory_bytes"):
+        assert told[key] == 3 * of_one[key]
+    assert told["looks"] == of_one["looks"] and [step for step, *_ in told["looks"]] == [10, 20]
+    (changed,) = trained(Variant(PLAN, augmentation=Augmentation(1, 0.1, 0.1, 0.1)))
+    assert changed.looks[0].training_loss != plain.looks[0].training_loss
 
 
 def test_training_stops_where_validation_gets_no_better(halves):

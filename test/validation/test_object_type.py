@@ -93,8 +93,13 @@ def test_summary_lines_and_picture(tmp_path):
     assert told["network_needs"] == {"as trained": 100, "poses off": None}
     assert told["as trained: Bayes3D"]["images"] == 120 and told["as trained: network 10"]["calibration_error"] is None
     assert told["as trained: Bayes3D"]["calibration_error"] == pytest.approx(0.2)
+    rows.append(made_up(object_type.ENSEMBLE, 10, 0.85))
+    assert object_type.summary(rows)["network_needs"]["as trained"] == 10
     paths = object_type.plot(rows, tmp_path)
     assert [path.suffix for path in paths] == [".pdf", ".png"] and all(path.stat().st_size > 1000 for path in paths)
+    rows[0] |= {"looks": [[50, 1.0, 1.1], [100, 0.8, 0.9]], "steps": 100, "validation_loss": 0.9}
+    names = [path.name for path in object_type.plot(rows, tmp_path)]
+    assert names[2:] == ["object-type-training.pdf", "object-type-training.png"]
     assert "Bayes3D" in object_type.line(rows[2]) and object_type.plot([], tmp_path) == []
 
 

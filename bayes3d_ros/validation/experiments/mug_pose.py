@@ -7,6 +7,10 @@ Loss: cross-entropy from the exact posterior (`exact_yaw.py`: enumeration with t
 place and the stated noise). Images are those of `mug_images.py`; both methods are given the same pixels, and the parser
 the camera's pose. A von Mises is fitted to its 1,000 samples by maximum likelihood; beside that stands the loss of the
 samples themselves, through a narrow kernel.
+
+Networks have three sizes. Of the middle one there is also, at 1,000 and 10,000 images, what a reviewer would ask for:
+one trained on images that are shifted, offset and made noisier at random (`augmented`), and the mean of five
+(`ensemble`). `mug-pose-training` shows how the losses of all fell while they were trained.
 """
 
 import tempfile
@@ -30,6 +34,7 @@ from bayes3d_ros.settings import LearnerSettings, ParserSettings
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.mug_pose_plot import plot
 from bayes3d_ros.validation.networks import von_mises
+from bayes3d_ros.validation.networks.augmentation import Augmentation
 from bayes3d_ros.validation.networks.depth_input import DepthScale
 from bayes3d_ros.validation.networks.installed import require_networks
 from bayes3d_ros.validation.reference.exact_yaw import YAWS, entropy, every_yaw, yaw_axis, yaw_posterior
@@ -49,6 +54,7 @@ from bayes3d_ros.validation.statistics.yaw_samples import YawScores, kernel_dens
 __all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
 
 TRAINING, QUICK_TRAINING = (10, 30, 100, 300, 1000, 3000, 10_000), (10, 100)
+ASKED, QUICK_ASKED = (1000, 10_000), (100,)  # training images of the networks that a reviewer would ask for
 VIEWS, QUICK_VIEWS = (1, 2, 3, 5, 8, 10), (5,)
 TRUE_MESH = 0  # views of the model that is made from the mesh itself
 GROUPS, QUICK_GROUPS = 10, 1  # of test images a condition: a group has one camera and place
@@ -63,12 +69,15 @@ NETWORKS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "1 M": ((16, 32, 64, 128), (512, 256)),
     "7 M": ((16, 32, 64, 128), (2048, 1800)),
 }
+AUGMENTATION = Augmentation(shift=3, offset=0.02 / SCALE.spread, noise=0.006 / SCALE.spread, missing=0.04)
+AUGMENTED, ENSEMBLE = "augmented", "ensemble"
+ASKED_OF = "1 M"  # size of these networks
 SETTINGS = ParserSettings(
     fixed_objects=1, max_objects=1, unknown=False, particles=1000, score_width=MUG_CAMERA.width, sigma_max=0.01
 )
 LEARNED = LearnerSettings(voxel_size=0.005)
 PARSER = "Bayes3D"
-HEADER = f"{'method':<13} {'training':>8} {'test':<10} {'images':>6} {'cross-entropy':>13} {'log p(true)':>11} {'s':>7}"
+HEADER = f"{'method':<23} {'training':>8} {'test':<10} {'images':>6} {'cross-entropy':>13} {'log p(true)':>11} {'s':>7}"
 
 
 class Truth(NamedTuple):
@@ -98,31 +107,52 @@ def notes(quick: bool) -> list[str]:
     ]
 
 
-def sizes(quick: bool) -> tuple[list[str], tuple[int, ...], tuple[int, ...], int]:
-    """Networks, numbers of training images, numbers of views, groups of test images."""
+class NetworkStep(NamedTuple):
+    """A network to train."""
+
+    size: str  # of NETWORKS
+    kind: str  # "", AUGMENTED or ENSEMBLE
+    images: int
+
+    @property
+    def method(self) -> str:
+        """What rows call it."""
+        return f"network {self.size}" + (f" ({self.kind})" if self.kind else "")
+
+
+def network_steps(quick: bool) -> list[NetworkStep]:
+    """The networks, in the order of their steps."""
     if quick:
-        return list(NETWORKS)[:1], QUICK_TRAINING, QUICK_VIEWS, QUICK_GROUPS
-    return list(NETWORKS), TRAINING, (*VIEWS, TRUE_MESH), GROUPS
+        small = next(iter(NETWORKS))
+        plain = [NetworkStep(small, "", images) for images in QUICK_TRAINING]
+        return plain + [NetworkStep(small, kind, n) for n in QUICK_ASKED for kind in (AUGMENTED, ENSEMBLE)]
+    plain = [NetworkStep(size, "", images) for images in TRAINING for size in NETWORKS]
+    return plain + [NetworkStep(ASKED_OF, kind, images) for images in ASKED for kind in (AUGMENTED, ENSEMBLE)]
+
+
+def parser_sizes(quick: bool) -> tuple[tuple[int, ...], int]:
+    """Numbers of views, and groups of test images."""
+    return (QUICK_VIEWS, QUICK_GROUPS) if quick else ((*VIEWS, TRUE_MESH), GROUPS)
 
 
 def count(quick: bool) -> int:
     """A step is a trained network, or a group of test images of every condition with a number of views."""
-    networks, training, views, groups = sizes(quick)
-    return len(networks) * len(training) + len(views) * groups
+    views, groups = parser_sizes(quick)
+    return len(network_steps(quick)) + len(views) * groups
 
 
 def steps(quick: bool) -> Iterator[Step]:
     """Networks, then the parser with every number of views in turn."""
-    networks, training, views, groups = sizes(quick)
+    networks, (views, groups) = network_steps(quick), parser_sizes(quick)
     mug = cache(upright_mug)
     yaws, each = (QUICK_YAWS, QUICK_GROUP) if quick else (YAWS, GROUP)
     fixed = cache(lambda: every_yaw(mug(), mug_view(TRAINED, np.random.default_rng(0)), yaws))
     truth = cache(partial(group_truth, mug, fixed, each))
     known = cache(partial(known_mug, mug))
-    images = cache(lambda: mug_images(mug(), TRAINED, training[-1], (TRAINING_SEED,)))
-    for size in training:
-        for network in networks:
-            yield partial(_network_rows, network, size, images, partial(_all_groups, truth, groups), quick)
+    most = max(step.images for step in networks)
+    images = cache(lambda: mug_images(mug(), TRAINED, most, (TRAINING_SEED,)))
+    for step in networks:
+        yield partial(_network_rows, step, images, partial(_all_groups, truth, groups), quick)
     for group in range(groups):
         for seen in views:
             yield partial(_parser_rows, seen, group, truth, known)
@@ -148,41 +178,35 @@ def _all_groups(truth: Callable[[str, int], Truth], groups: int, condition: str)
 
 
 def _network_rows(
-    name: str,
-    size: int,
+    step: NetworkStep,
     images: Callable[[], MugImages],
     tests: Callable[[str], list[Truth]],
     quick: bool,
 ) -> list[Row]:
     """A row a condition, of a network trained on so many images."""
-    import jax
+    from bayes3d_ros.validation.networks.models import NetworkPlan
+    from bayes3d_ros.validation.networks.training import TrainingPlan
+    from bayes3d_ros.validation.networks.variants import Variant, predictions_of, train_variant, training_told
 
-    from bayes3d_ros.validation.networks import models, training
-
-    every = images()
-    depth, yaw = SCALE.as_input(every.depth[:size]), every.yaw[:size].astype(np.float32)
-    plan = training.TrainingPlan(most_steps=QUICK_STEPS, check_every=20) if quick else training.TrainingPlan()
-    network = models.DepthNetwork(models.NetworkPlan(*NETWORKS[name]), depth.shape[1:], 2, jax.random.key(0))
-    trained = training.train_best(network, depth, yaw, von_mises.output_loss, plan, seed=size)
-    parameters = models.parameter_count(network)
+    every, plain = images(), Variant(NetworkPlan(*NETWORKS[step.size]))
+    variant = {"": plain, AUGMENTED: plain._replace(augmentation=AUGMENTATION), ENSEMBLE: plain._replace(members=5)}
+    depth, yaw = SCALE.as_input(every.depth[: step.images]), every.yaw[: step.images].astype(np.float32)
+    plan = TrainingPlan(most_steps=QUICK_STEPS, check_every=20) if quick else TrainingPlan()
+    members = train_variant(variant[step.kind], depth, yaw, 2, von_mises.output_loss, plan, seed=step.images)
+    told = training_told(members)
     rows = []
     for condition in MUG_CONDITIONS:
         scores: list[YawScores] = []
         groups = tests(condition)
         for truth in groups:
-            outputs = training.predictions(trained.network, SCALE.as_input(truth.images.depth))
-            scores += _von_mises_scores(von_mises.of_outputs(outputs.astype(float)), truth)
-        row = _row(f"network {name}", size, condition, scores, groups)
-        rows.append(
-            row
-            | {"seconds": round(trained.seconds, 2), "parameters": parameters, "memory_bytes": 4 * parameters}
-            | {"file_bytes": models.file_bytes(network), "rate": trained.rate, "steps": trained.steps}
-            | {"training_loss": round(trained.training_loss, 5), "validation_loss": round(trained.validation_loss, 5)}
-        )
+            said = predictions_of(members, SCALE.as_input(truth.images.depth))
+            each = zip(*(von_mises.of_outputs(outputs) for outputs in said), strict=True)
+            scores += _von_mises_scores([von_mises.Mixture(together) for together in each], truth)
+        rows.append(_row(step.method, step.images, condition, scores, groups) | told)
     return rows
 
 
-def _von_mises_scores(said: Sequence[von_mises.VonMises], truth: Truth) -> list[YawScores]:
+def _von_mises_scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], truth: Truth) -> list[YawScores]:
     axis = yaw_axis(truth.posterior.shape[1])
     return [
         yaw_scores(q.log_density, axis, exact, yaw)
@@ -282,7 +306,7 @@ def _samples_of(mug: KnownMug, images: MugImages, k: int, stamp_ns: int) -> tupl
 def line(row: Row) -> str:
     """A row, under HEADER."""
     return (
-        f"{row['method']:<13} {row['training'] or 'mesh':>8} {row['test']:<10} {len(row['cross_entropy']):>6} "
+        f"{row['method']:<23} {row['training'] or 'mesh':>8} {row['test']:<10} {len(row['cross_entropy']):>6} "
         f"{np.mean(row['cross_entropy']):>13.3f} {np.mean(row['log_p_true']):>11.3f} {row['seconds']:>7.1f}"
     )
 

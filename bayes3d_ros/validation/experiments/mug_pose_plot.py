@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The picture of the mug-pose experiment: cross-entropy by what was learned from, in and out of distribution; sizes."""
+"""The pictures of the mug-pose experiment: cross-entropy by what was learned from, in and out of distribution; sizes;
+how networks were trained."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from matplotlib.ticker import NullLocator
 from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame, save_both
+from bayes3d_ros.validation.experiments.training_plot import plot_training
 
 PARSER = "Bayes3D"
 LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
@@ -21,7 +23,8 @@ _KIB = 1024
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write mug-pose, as PDF and PNG: a column a condition, then memory; above cross-entropy, below log p(true yaw)."""
+    """Write mug-pose, as PDF and PNG: a column a condition, then memory; above cross-entropy, below log p(true yaw).
+    And mug-pose-training, see `plot_training`."""
     conditions = list(dict.fromkeys(row["test"] for row in rows))
     if not conditions:
         return []
@@ -39,7 +42,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         label_plot(axis, "KiB", "", title, size=8)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    return save_both(figure, folder / "mug-pose")
+    return save_both(figure, folder / "mug-pose") + plot_training(rows, folder / "mug-pose-training")
 
 
 def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, str | None]) -> None:

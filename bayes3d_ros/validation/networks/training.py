@@ -13,6 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
+from bayes3d_ros.validation.networks.augmentation import Augmentation, augmented
 from bayes3d_ros.validation.networks.models import DepthNetwork
 
 Loss = Callable[[Array, Array], Array]  # outputs [B, O] and targets [B] to nats [B]
@@ -30,6 +31,15 @@ class TrainingPlan(NamedTuple):
     patience: int = 12  # looks without a better loss, after which training stops
     validation: float = 0.2  # share of the images
     decay: float = 1e-4
+    augmentation: Augmentation | None = None  # of the images that are trained on
+
+
+class Look(NamedTuple):
+    """How far a network has come. Nats."""
+
+    step: int
+    training_loss: float  # mean of the batches since the last look
+    validation_loss: float
 
 
 class Trained(NamedTuple):
@@ -41,6 +51,7 @@ class Trained(NamedTuple):
     training_loss: float  # nats, of the images that it was trained on
     validation_loss: float
     seconds: float  # of all learning rates
+    looks: tuple[Look, ...] = ()  # at the learning rate that was chosen
 
 
 def train_best(
@@ -92,21 +103,24 @@ def _train(
     (rate,) = plan.rates
     method = Method(loss, plan.decay)
     state = method.adam.init(eqx.filter(network, eqx.is_inexact_array))
-    rng = np.random.default_rng(seed)
+    rng, changes = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     best = Trained(network, rate, 0, np.nan, mean_loss(network, *held_out, loss), 0.0)
-    worse = 0
+    worse, looks, losses = 0, [], []
     for step in range(1, plan.most_steps + 1):
         drawn = rng.integers(len(images), size=plan.batch)
-        batch = jnp.asarray(images[drawn]), jnp.asarray(targets[drawn])
-        network, state = _step(network, state, batch, jnp.float32(rate), method)
+        seen = images[drawn] if plan.augmentation is None else augmented(images[drawn], plan.augmentation, changes)
+        batch = jnp.asarray(seen), jnp.asarray(targets[drawn])
+        network, state, mean = _step(network, state, batch, jnp.float32(rate), method)
+        losses.append(mean)
         if step % plan.check_every == 0:
             now = mean_loss(network, *held_out, loss)
-            worse += 1
+            looks.append(Look(step, float(np.mean(jax.device_get(losses))), now))
+            worse, losses = worse + 1, []
             if now < best.validation_loss:
                 best, worse = best._replace(network=network, steps=step, validation_loss=now), 0
             if worse >= plan.patience or not np.isfinite(now):
                 break
-    return best
+    return best._replace(looks=tuple(looks))
 
 
 class Method(NamedTuple):
@@ -129,13 +143,14 @@ def _forward(network: DepthNetwork, images: Float[Array, "N channels height widt
 @eqx.filter_jit
 def _step(
     network: DepthNetwork, state: PyTree, batch: tuple[Array, Array], rate: Float[Array, ""], method: Method
-) -> tuple[DepthNetwork, PyTree]:
-    """One step of AdamW on a batch of images and targets."""
+) -> tuple[DepthNetwork, PyTree, Float[Array, ""]]:
+    """One step of AdamW on a batch of images and targets; and the loss before the step."""
     images, targets = batch
 
     def total(network: DepthNetwork) -> Array:
         return method.loss(jax.vmap(network)(images), targets).mean()
 
     weights = eqx.filter(network, eqx.is_inexact_array)
-    updates, state = method.adam.update(eqx.filter_grad(total)(network), state, weights)
-    return eqx.apply_updates(network, jax.tree.map(lambda u: -rate * u, updates)), state
+    value, gradient = eqx.filter_value_and_grad(total)(network)
+    updates, state = method.adam.update(gradient, state, weights)
+    return eqx.apply_updates(network, jax.tree.map(lambda u: -rate * u, updates)), state, value

@@ -30,6 +30,17 @@ class VonMises(NamedTuple):
         return k * (np.cos(angle - self.mean) - 1) - np.log(2 * np.pi * i0e(k))
 
 
+class Mixture(NamedTuple):
+    """The mean of several densities."""
+
+    members: tuple[VonMises, ...]
+
+    def log_density(self, angle: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """Nats a radian."""
+        each = np.stack([one.log_density(angle) for one in self.members])
+        return np.logaddexp.reduce(each) - np.log(len(each))
+
+
 def fit(angles: Float[np.ndarray, "N"], weights: Float[np.ndarray, "N"] | None = None) -> VonMises:
     """By maximum likelihood; of weighted angles the weighted likelihood. The concentration is limited to
     LARGEST_CONCENTRATION."""
