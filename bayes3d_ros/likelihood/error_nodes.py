@@ -35,6 +35,7 @@ _PAIRS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # stand
 _STANDING = 0.008  # metres in front of the table from which returns that touch are an object's
 _LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
 _FEWEST_CELLS = 10
+_NO_INLIERS = 1e-6  # returns: with fewer inliers than that, they say nothing of sigma
 _STEPS = 12
 _MOST_SDS = 3.0  # most by which a scene's noise moves away from what the table says
 _WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations if the table says nothing
@@ -136,7 +137,7 @@ def table_errors(cells: _TableCells, wave: float, sigma_max: float) -> TableErro
         of_table = 2 * np.square(tied).sum() + AMPLITUDE_LOG_SD**-2
         inliers, squares = _expected(of, variance[:, None] * cells.precision / sigma**2)
         returns = cells.real.sum()
-        mean[0] += 0.5 * np.log(squares / inliers)
+        mean[0] += 0.5 * np.log((squares + _NO_INLIERS) / (inliers + _NO_INLIERS))
         mean[1] = np.log((returns - inliers + 1) / (inliers + 1))
         if wave > 0:
             # A step of Newton's on the log posterior of log tau, whose information the offsets' own is not part of.
@@ -164,11 +165,11 @@ def _inliers(cells: _TableCells, offset: Float[np.ndarray, "C"], sigma: float, p
 
 def _expected(of: _Inliers, variance: Float[np.ndarray, "C K"]) -> tuple[float, float]:
     """Mean number of inliers, and of their squares `off2`, over offsets of this variance (in variances of a return): to
-    its first power."""
+    its first power, as far as that leaves numbers of inliers between 0 and 1 and no negative squares."""
     share, off2, unsure = of.share, of.off2, of.share * (1 - of.share)
     inliers = share + 0.5 * variance * unsure * ((1 - 2 * share) * off2 - 1)
     squares = share * (off2 + variance) + 0.5 * variance * unsure * ((1 - 2 * share) * off2**2 - 5 * off2)
-    return inliers.sum(), squares.sum()
+    return np.clip(inliers, 0.0, 1.0).sum(), np.maximum(squares, 0.0).sum()
 
 
 def _table_cells(image: ScoredImage, inside, spread, block: int) -> _TableCells:

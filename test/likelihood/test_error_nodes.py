@@ -81,6 +81,19 @@ def test_with_outliers_it_is_where_the_posterior_is_flat():
     np.testing.assert_allclose(slopes, 0, atol=0.1)
 
 
+@pytest.mark.parametrize("width", [1e-6, 1e-3, 0.02, 1.0])
+@pytest.mark.parametrize("returns", [1, 9])
+def test_whatever_returns_say_nodes_are_numbers(width, returns):
+    """Cells of few returns, spread so that nearly all may be inliers or not, or none is."""
+    rng = np.random.default_rng(0)
+    residual = rng.uniform(-width, width, (50, 9))
+    ones = np.ones(residual.shape)
+    real = np.arange(9) < returns * ones
+    for wave in (0.0, 0.001):
+        found = table_errors(_TableCells(residual, ones, ones, real), wave, SIGMA_MAX)
+        assert np.isfinite(found.mean).all() and (found.sd > 0).all()
+
+
 def test_a_table_that_is_hardly_seen_tells_nothing():
     """The priors' own middles and widths."""
     none = np.zeros((0, 9))
