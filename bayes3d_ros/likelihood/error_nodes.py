@@ -159,8 +159,16 @@ def _inliers(cells: _TableCells, offset: Float[np.ndarray, "C"], sigma: float, p
     inlier = (1 - p) * np.exp(-0.5 * off2) * np.sqrt(cells.precision / (2 * np.pi)) / sigma
     share = np.where(cells.real, inlier / (inlier + p * cells.outlier), 0.0)
     weight = share * cells.precision / sigma**2
-    told, unsure = weight.sum(1), ((1 - share) * weight * off2).sum(1)
-    return _Inliers(share, off2, weight, np.maximum(told - unsure, LEAST_CURVATURE * told))
+    return _Inliers(share, off2, weight, peak_curvature(share, off2, weight))
+
+
+def peak_curvature(
+    share: Float[np.ndarray, "C K"], off2: Float[np.ndarray, "C K"], weight: Float[np.ndarray, "C K"]
+) -> Float[np.ndarray, "C"]:
+    """Of the log likelihood of each cell's offset at its mode, less its sign, 1 / metres^2. share: probability that a
+    return is no outlier; off2: squares of residuals, in standard deviations; weight: share / variance."""
+    known, unsure = weight.sum(1), ((1 - share) * weight * off2).sum(1)
+    return np.maximum(known - unsure, LEAST_CURVATURE * known)
 
 
 def _expected(of: _Inliers, variance: Float[np.ndarray, "C K"]) -> tuple[float, float]:

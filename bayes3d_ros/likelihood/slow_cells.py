@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr
 
-from bayes3d_ros.likelihood.error_nodes import LEAST_CURVATURE
+from bayes3d_ros.likelihood.error_nodes import peak_curvature
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
@@ -105,10 +105,8 @@ def _follow(cells: SurfaceCells, b: Float[np.ndarray, "C"], sigma: float, p: flo
         weight = share * cells.precision
         b = np.where(share.sum(1) > 1e-6, (weight * cells.residual).sum(1) / np.maximum(weight.sum(1), 1e-12), b)
     share, logs = parts(b)
-    curvature = (share * cells.precision).sum(1) / sigma**2
     off2 = np.square(cells.residual - b[:, None]) * cells.precision / sigma**2
-    unsure = (share * (1 - share) * off2 * cells.precision).sum(1) / sigma**2  # which returns are outliers
-    return logs.sum(1), b, np.maximum(curvature - unsure, LEAST_CURVATURE * curvature), share.sum(1)
+    return logs.sum(1), b, peak_curvature(share, off2, share * cells.precision / sigma**2), share.sum(1)
 
 
 def cells_of(

@@ -33,8 +33,7 @@ from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import LearnerSettings, ParserSettings
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.mug_pose_plot import plot
-from bayes3d_ros.validation.networks import von_mises
-from bayes3d_ros.validation.networks.augmentation import Augmentation
+from bayes3d_ros.validation.networks import augmentation, von_mises
 from bayes3d_ros.validation.networks.depth_input import DepthScale
 from bayes3d_ros.validation.networks.installed import require_networks
 from bayes3d_ros.validation.reference.exact_yaw import YAWS, entropy, every_yaw, yaw_axis, yaw_posterior
@@ -69,7 +68,7 @@ NETWORKS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "1 M": ((16, 32, 64, 128), (512, 256)),
     "7 M": ((16, 32, 64, 128), (2048, 1800)),
 }
-AUGMENTATION = Augmentation(shift=3, offset=0.02 / SCALE.spread, noise=0.006 / SCALE.spread, missing=0.04)
+AUGMENTATION = augmentation.usual(SCALE, shift=3)
 AUGMENTED, ENSEMBLE = "augmented", "ensemble"
 ASKED_OF = "1 M"  # size of these networks
 SETTINGS = ParserSettings(

@@ -31,7 +31,7 @@ from bayes3d_ros.posterior.types import ParseError, SceneSamples
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.object_type_plot import NETWORK, plot
-from bayes3d_ros.validation.networks.augmentation import Augmentation
+from bayes3d_ros.validation.networks import augmentation
 from bayes3d_ros.validation.networks.depth_input import DepthScale
 from bayes3d_ros.validation.networks.installed import require_networks
 from bayes3d_ros.validation.simulate.occluded_images import (
@@ -61,7 +61,7 @@ QUICK_STEPS = 60
 SCALE = DepthScale(1.0, 0.3)
 SETTINGS = ParserSettings(fixed_objects=2, max_objects=2, unknown=False, score_width=OCCLUDED_CAMERA.width)
 VOXEL = 0.004  # metres
-AUGMENTATION = Augmentation(shift=4, offset=0.02 / SCALE.spread, noise=0.006 / SCALE.spread, missing=0.04)
+AUGMENTATION = augmentation.usual(SCALE, shift=4)
 PARSER = "Bayes3D"
 WIDE, AUGMENTED, ENSEMBLE = "network (wider)", "network (augmented)", "network (ensemble)"
 HEADER = f"{'method':<19} {'training':>8} {'test':<10} {'images':>6} {'right':>6} {'log loss':>8} {'s':>7}"

@@ -7,6 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from bayes3d_ros.validation.networks.depth_input import DepthScale
+
+OFFSET, NOISE, MISSING = 0.02, 0.006, 0.04  # metres, metres, share: what experiments change images by
+
 
 class Augmentation(NamedTuple):
     """Each image has changes of its own, of these sizes. Depths are in units of `DepthScale.spread`."""
@@ -15,6 +19,11 @@ class Augmentation(NamedTuple):
     offset: float  # standard deviation of what is added to all depths
     noise: float  # the most that a standard deviation of pixels' noise is: uniform from zero
     missing: float  # the most that a share of lost returns is: uniform from zero
+
+
+def usual(scale: DepthScale, shift: int) -> Augmentation:
+    """What experiments change images by. shift: pixels."""
+    return Augmentation(shift, OFFSET / scale.spread, NOISE / scale.spread, MISSING)
 
 
 def augmented(
