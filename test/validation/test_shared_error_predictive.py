@@ -11,12 +11,14 @@ from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.error_nodes import ErrorNodes
 from bayes3d_ros.likelihood.scored_image import scored_image
 from bayes3d_ros.likelihood.shared_errors import BLOCK_SIDE, shared_error_image
+from bayes3d_ros.likelihood.slow_cells import cells_of
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT, TABLE, kinds_of_pixels
-from bayes3d_ros.likelihood.slow_shared_errors import log_density
+from bayes3d_ros.likelihood.slow_shared_errors import log_density, objects_of, with_shared_errors
 from bayes3d_ros.parsing.observe import amplitudes_of
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference import shared_error_problem
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
+from bayes3d_ros.validation.reference.shared_error_cells import DrawnCells
 from bayes3d_ros.validation.reference.shared_error_frame import (
     PinholeRays,
     RenderedScene,
@@ -54,12 +56,21 @@ def image_of(depth):
 
 def log_value(image, scene, errors, amplitudes):
     """log density, with the margin of ERRORS: what is told apart is not the margin."""
+    return log_density(scene.depth, scene.label, image, density_of(image, errors, amplitudes, scene))[0, 0]
+
+
+def density_of(image, errors, amplitudes, scene):
+    """Of an image with these errors alone; of several scales the mean."""
     margin = margin_of(ERRORS, spread_of(scene))
     shared = shared_error_image(image, amplitudes, SIGMA_MAX)._replace(table_margin=margin)
+    scales = len(errors.scale)
     nodes = ErrorNodes(
-        *(np.array([value]) for value in errors[:3]), np.array(errors.scale), np.zeros((1, 1)), np.zeros(1)
+        *(np.array([value]) for value in errors[:3]),
+        np.array(errors.scale),
+        np.zeros((1, 1)),
+        np.full(scales, -np.log(scales)),
     )
-    return log_density(scene.depth, scene.label, image, at_nodes(image, shared, nodes))[0, 0]
+    return at_nodes(image, shared, nodes)
 
 
 def log_mass(scene, errors=ERRORS):
@@ -99,6 +110,27 @@ def test_images_with_more_noise_are_not(monkeypatch):
     monkeypatch.setattr(f"{__name__}.IMAGES", 5)
     ratio = np.exp(log_ratios([(plate(), ERRORS._replace(sigma=1.03 * ERRORS.sigma))], noise_error=1.5))
     assert ratio.min() > 5
+
+
+def test_edges_are_off_as_the_density_has_them(monkeypatch):
+    """By what the cells of an object show with the scale in the middle, 1, whatever the object's own scale is."""
+    told = []
+
+    def spy(cells, v, u, original=DrawnCells.shared_error_at):
+        told.append((v, u, original(cells, v, u)))
+        return told[-1][-1]
+
+    monkeypatch.setattr(DrawnCells, "shared_error_at", spy)
+    errors, scene = ERRORS._replace(scale=(2.83,)), plate()
+    image = image_of(sample_shared_depth(np.random.default_rng(0), scene, RAYS, errors, WITHOUT_BAD, LIMITS))
+    density = density_of(image, errors._replace(scale=(0.35, 1.0, 2.83)), WITHOUT_BAD, scene)
+    kinds = kinds_of_pixels(scene.depth, scene.label, image, density)
+    cells = cells_of(scene.depth, scene.label, kinds, image, density)
+    objects = objects_of(cells, scene.depth, scene.label, kinds, image, density)
+    seen = with_shared_errors(scene.depth, scene.label, objects)
+    ((v, u, off),) = told
+    np.testing.assert_allclose(off, (seen - scene.depth)[v, u], atol=5e-6)
+    assert np.abs(off).max() > 0.001
 
 
 def test_outlines_are_those_of_the_density():

@@ -188,7 +188,8 @@ class DrawnCells:
 
     def shared_error_at(self, v: Int[np.ndarray, "P"], u: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
         """Metres that the object's surface seems to be off at these rows and columns, by the error that its cells
-        share: at its mode, as the density has it for edges. Cells that stand in front say nothing."""
+        share: at its mode with amplitudes of scale 1, as the density has it for edges whatever the object's scale is.
+        Cells that stand in front say nothing."""
         if not self.told_of:
             return np.zeros(len(v))
         number = sorted(self.told_of)
@@ -199,8 +200,10 @@ class DrawnCells:
             np.array([at.get(int(side[c]), -1) for c in number]) for side in (self.beside.left, self.beside.above)
         )
         beside = Neighbours(left, above, self.beside.alike[number])
-        share, none = float(self.frame.amplitudes.bad_share), np.full(len(number), -np.inf)
-        of = ObjectErrors(found, none, medians, self.phi[number], beside, share, self.model, self.waves, self.prior)
+        usual, none = self.frame.amplitudes, np.full(len(number), -np.inf)
+        share, model, waves = float(usual.bad_share), float(usual.model) ** 2, float(usual.wave) ** 2
+        prior = shared_variances(1.0, usual)
+        of = ObjectErrors(found, none, medians, self.phi[number], beside, share, model, waves, prior)
         return self.middle.phi(u, v) @ shared_error(of)
 
     def _around_middle(self, c: int, of: int) -> Float[np.ndarray, "K 3"]:
