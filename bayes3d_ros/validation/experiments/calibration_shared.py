@@ -41,7 +41,7 @@ __all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summa
 
 SHARED_SCENES, QUICK_SHARED_SCENES = 500, 60
 # Of scenes that chose nothing: those of 21 led to the second run of `parsing/sampler_runs.py`, those of 22 to the
-# curvature of a cell's peak (`slow_cells.py`).
+# curvature of a cell's peak (`slow_cells.py`), those of 23 to where images have their edges (`shared_error_cells.py`).
 SHARED_SEED = 24
 LEAST_SIGMA, MOST_OUTLIERS = 2e-4, 0.1  # metres, share: ends of the priors of truths; sigma's other one is `sigma_max`
 NOISE = ("sigma", "p_outlier")

@@ -31,6 +31,9 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         _curves(axes[k, 0], own, label)
         _widths(axes[k, 1], own, "position", 1e3, "mm", 0.05)
         _widths(axes[k, 2], own, "yaw", 180 / np.pi, "deg", 0.02)
+    # Types below all panels: within one they would hide points.
+    types, names = axes[0, 1].get_legend_handles_labels()
+    figure.legend(types, names, fontsize=8, frameon=False, loc="outside lower center", ncols=max(len(names), 1))
     path = folder / "coverage.png"
     figure.savefig(path, dpi=110)
     return [path]
@@ -53,7 +56,7 @@ def _curves(axis: Axes, rows: Sequence[Row], label: str) -> None:
     label_plot(
         axis, "probability of the region", "share of scenes in which it holds the truth", f"{label}, {len(rows)} scenes"
     )
-    axis.legend(fontsize=8, frameon=False, loc="upper left", title="grey: right, 2 binomial errors", title_fontsize=8)
+    axis.legend(fontsize=8, frameon=False, loc="best", title="grey: right, 2 binomial errors", title_fontsize=8)
 
 
 def _levels(rows: Sequence[Row], name: str) -> list[float | None]:
@@ -82,5 +85,3 @@ def _widths(axis: Axes, rows: Sequence[Row], name: str, scale: float, unit: str,
     title = {"position": "Position on the table", "yaw": "Yaw, symmetry taken out"}[name]
     open_frame(axis)
     label_plot(axis, f"half of the 90 % region's width, {unit}", f"error of the mean, {unit}", title)
-    if name == "position":
-        axis.legend(fontsize=7.5, frameon=False, loc="lower right")
