@@ -6,7 +6,7 @@ to the density they are."""
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayes3d_ros.likelihood.own_plane import ANEW, BEND_SD, DEPTH_SD, SLOPE_SD, STEP_SD
+from bayes3d_ros.likelihood.own_plane import ANEW, DEPTH_SD, SLOPE_SD
 from bayes3d_ros.likelihood.shared_errors import (
     BAD_DEPTH,
     BAD_SPREAD,
@@ -26,6 +26,7 @@ from bayes3d_ros.likelihood.slow_object_cells import (
     shared_variances,
 )
 from bayes3d_ros.likelihood.slow_pixel_kinds import OBJECT
+from bayes3d_ros.validation.reference.own_plane_draws import FittedPlane, fitted_plane, plane_that_goes_on
 from bayes3d_ros.validation.reference.shared_error_frame import (
     ErrorFrame,
     RenderedScene,
@@ -68,7 +69,7 @@ class DrawnCells:
         length = float(amplitudes.length)
         self.beside = neighbours(number % across, number // across, self.phi, length)
         self.told, self.told_place = np.zeros((2, len(middle)))
-        self.planes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.planes: dict[int, FittedPlane] = {}
         self.told_of: dict[int, tuple[float, CellModes]] = {}  # median residual, metres, and likelihood of the offset
         self.process = self._process(length) if whole_waves else None
 
@@ -211,14 +212,12 @@ class DrawnCells:
         (v, u), (rows, columns) = self.pixels[of], self.pixels[c]
         return np.column_stack([np.ones(len(v)), (u - columns.mean()) * self.metres, (v - rows.mean()) * self.metres])
 
-    def _fitted(self, c: int, returns: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
-        """The plane that a cell's inliers show, metres and slopes, and its information."""
+    def _fitted(self, c: int, returns: np.ndarray, offset: float) -> FittedPlane:
+        """The plane that a cell's inliers show."""
         noise = self.frame.noise[self.pixels[c]]
         off = returns - self.scene.depth[self.pixels[c]] - offset
         weight = np.where(np.abs(off) < 5 * noise + 0.003, noise**-2, 0.0)
-        phi, prior = self._around_middle(c, c), np.diag([DEPTH_SD**-2, SLOPE_SD**-2, SLOPE_SD**-2])
-        information = (phi.T * weight) @ phi + prior
-        return np.linalg.solve(information, (phi.T * weight) @ returns + prior[0] * np.median(returns)), information
+        return fitted_plane(self._around_middle(c, c), returns, weight)
 
     def _own_plane(self, c: int) -> Float[np.ndarray, "K"] | None:
         """Depths of a cell that is a plane of its own, metres, as `own_plane.py` has it; None where that is less than a
@@ -226,18 +225,11 @@ class DrawnCells:
         depth, phi = self.scene.depth[self.pixels[c]], self._around_middle(c, c)
         others = [k for k in (self.beside.left[c], self.beside.above[c]) if k in self.planes]
         if others and self.rng.random() >= ANEW:
-            return phi @ self._gone_on(c, int(self.rng.choice(others)))
+            other = int(self.rng.choice(others))
+            apart = -self._around_middle(c, other)[:, 1:].mean(0)
+            return phi @ plane_that_goes_on(self.rng, self.planes[other], apart)
         if self.rng.random() >= _NEW_PLANES:
             return None
         own = phi @ np.append(0.0, SLOPE_SD * self.rng.standard_normal(2))
         off = self.phi[c] @ self.shared + self.rng.uniform(_NEAREST, _FARTHEST)
         return own - np.median(own - depth) + off
-
-    def _gone_on(self, c: int, other: int) -> Float[np.ndarray, "3"]:
-        """The plane of a neighbour, turned and displaced, about the middle of the cell c."""
-        plane, information = self.planes[other]
-        apart = -self._around_middle(c, other)[:, 1:].mean(0)
-        turned = BEND_SD * self.rng.standard_normal(2)
-        plane = plane + np.linalg.cholesky(np.linalg.inv(information)) @ self.rng.standard_normal(3)
-        here = plane[0] + plane[1:] @ apart + turned @ apart / 2 + STEP_SD * self.rng.standard_normal()
-        return np.append(here, plane[1:] + turned)

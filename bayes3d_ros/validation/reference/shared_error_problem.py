@@ -48,9 +48,16 @@ from bayes3d_ros.validation.reference.prior_predictive import DepthRange
 from bayes3d_ros.validation.reference.shared_error_frame import PinholeRays, RenderedScene, TrueErrors, lost_mass
 from bayes3d_ros.validation.reference.shared_error_predictive import sample_shared_depth
 
-SHARED_CAMERA = Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120)  # of a D435
-SHARED_DISTANCE = 0.85  # metres from the table's middle
-SHARED_ELEVATION = np.radians(60)  # of the view below the horizon
+
+class TableView(NamedTuple):
+    """A camera that looks at the table's middle."""
+
+    camera: Intrinsics
+    distance: float  # metres from the table's middle
+    elevation: float  # radians, of the view below the horizon
+
+
+SHARED_VIEW = TableView(Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120), 0.85, np.radians(60))  # of a D435
 SHARED_SETTINGS = ParserSettings(
     max_objects=3,
     count_ratio=1.0,
@@ -71,6 +78,7 @@ class SharedProblem(NamedTuple):
 
     library: LibraryArrays
     table: PriorTable
+    camera: Intrinsics
     bare: Float[np.ndarray, "H W"]  # metres: depth of the empty table
     rays: PinholeRays
     limits: DepthRange
@@ -94,18 +102,22 @@ class SharedPosterior(NamedTuple):
         return self.samples._replace(weight=weight / weight.sum())
 
 
-def shared_problem(library: Library, settings: ParserSettings = SHARED_SETTINGS) -> SharedProblem:
-    """The library on a table seen from above at 60 degrees."""
-    c, s = np.cos(SHARED_ELEVATION), np.sin(SHARED_ELEVATION)
-    T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, SHARED_DISTANCE], [0, 0, 0, 1]])
-    rays = SHARED_CAMERA.rays().astype(np.float64)
+def shared_problem(
+    library: Library, settings: ParserSettings = SHARED_SETTINGS, view: TableView = SHARED_VIEW
+) -> SharedProblem:
+    """The library on a table seen from above."""
+    camera, distance, elevation = view
+    c, s = np.cos(elevation), np.sin(elevation)
+    T_camera_table = np.array([[1, 0, 0, 0], [0, -s, -c, 0], [0, c, -s, distance], [0, 0, 0, 1]])
+    rays = camera.rays().astype(np.float64)
     bare = T_camera_table[:3, 2] @ T_camera_table[:3, 3] / (rays @ T_camera_table[:3, 2])
     size = jnp.array((settings.table_width, settings.table_depth), jnp.float32)
     return SharedProblem(
         library_arrays(library),
         PriorTable(jnp.asarray(T_camera_table, jnp.float32), size),
+        camera,
         bare,
-        PinholeRays(rays[0, :, 0], rays[:, 0, 1], np.array([SHARED_CAMERA.fx, SHARED_CAMERA.fy])),
+        PinholeRays(rays[0, :, 0], rays[:, 0, 1], np.array([camera.fx, camera.fy])),
         DepthRange(settings.near, settings.far),
         amplitudes_of(settings),
         np.arange(settings.max_objects + 1) * np.log(settings.count_ratio),
@@ -118,7 +130,7 @@ def image_of(depth: Float[np.ndarray, "H W"], problem: SharedProblem) -> ScoredI
     settings = problem.settings
     inside = np.full(depth.shape, IN_WORKSPACE)
     return scored_image(
-        SHARED_CAMERA,
+        problem.camera,
         depth,
         inside,
         problem.bare,
