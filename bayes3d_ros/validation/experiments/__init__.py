@@ -19,6 +19,7 @@ EXPERIMENTS: dict[str, str] = {
     "calibration-points": "bayes3d_ros.validation.experiments.calibration_points",
     "calibration-shared": "bayes3d_ros.validation.experiments.calibration_shared",
     "calibration-shared-known-noise": "bayes3d_ros.validation.experiments.calibration_shared_known_noise",
+    "calibration-unknown": "bayes3d_ros.validation.experiments.calibration_unknown",
     "camera-tracking": "bayes3d_ros.validation.experiments.camera_tracking",
     "coverage": "bayes3d_ros.validation.experiments.coverage",
     "coverage-tables": "bayes3d_ros.validation.experiments.coverage_tables",

@@ -23,15 +23,21 @@ NAMES = {
 _BINS, _INSIDE = 20, 0.99  # of the histograms; of the bands
 
 
-def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write calibration.png."""
+def plot(
+    rows: Sequence[Row],
+    folder: Path,
+    name: str = "calibration",
+    latents: Sequence[str] = tuple(NAMES),
+    probabilities: Sequence[str] = ("n", "type", "face"),
+) -> list[Path]:
+    """Write NAME.png: ranks of these latents, and what became of these probabilities."""
     figure = Figure(figsize=(17, 9), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     above, below = figure.subfigures(2, 1, height_ratios=(1.75, 1), squeeze=False)[:, 0]
-    axes = above.subplots(2, len(NAMES))
-    for k, (name, title) in enumerate(NAMES.items()):
-        ranks = np.array([row["rank"][name] for row in rows if row["rank"][name] is not None])
-        _histogram(axes[0, k], ranks, title)
+    axes = above.subplots(2, len(latents))
+    for k, latent in enumerate(latents):
+        ranks = np.array([row["rank"][latent] for row in rows if row["rank"][latent] is not None])
+        _histogram(axes[0, k], ranks, NAMES[latent])
         _difference(axes[1, k], ranks)
     above.suptitle(
         f"Ranks of the truth among posterior samples, {len(rows)} scenes; grey: {_INSIDE:.0%} of uniform ranks",
@@ -39,9 +45,9 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     )  # fmt: skip
     axes[0, 0].set_ylabel("scenes", color=INK)
     axes[1, 0].set_ylabel("share of ranks below, less uniform", color=INK)
-    for axis, name in zip(below.subplots(1, 3), ("n", "type", "face"), strict=True):
-        _reliability(axis, [row for row in rows if row[name] is not None], name)
-    path = folder / "calibration.png"
+    for axis, kind in zip(below.subplots(1, len(probabilities)), probabilities, strict=True):
+        _reliability(axis, [row for row in rows if row[kind] is not None], kind)
+    path = folder / f"{name}.png"
     figure.savefig(path, dpi=100)
     return [path]
 
@@ -87,7 +93,7 @@ def _reliability(axis: Axes, rows: Sequence[Row], name: str) -> None:
     axis.set(xlim=(-0.04, 1.08), ylim=(-0.04, 1.04))
     axis.set_xlabel(f"p({name})", color=INK)
     axis.set_ylabel("share that came true", color=INK)
-    title = f"p({name}): predictions in ten bins, their number; grey: {_INSIDE:.0%} if they are right"
+    title = f"p({name}): ten bins, predictions in each; grey: {_INSIDE:.0%} if they are right"
     axis.set_title(title, fontsize=10, color=INK, loc="left")
     _open_with_small_ticks(axis)
 

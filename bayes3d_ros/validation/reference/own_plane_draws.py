@@ -23,7 +23,9 @@ def fitted_plane(
     """phi: 1, x and y of returns, metres; weight: their inverse variances, 0 of outliers."""
     prior = np.diag([DEPTH_SD**-2, SLOPE_SD**-2, SLOPE_SD**-2])
     information = (phi.T * weight) @ phi + prior
-    return FittedPlane(np.linalg.solve(information, (phi.T * weight) @ depth + prior[0] * np.median(depth)), information)
+    return FittedPlane(
+        np.linalg.solve(information, (phi.T * weight) @ depth + prior[0] * np.median(depth)), information
+    )
 
 
 def plane_that_goes_on(

@@ -48,6 +48,7 @@ from bayes3d_ros.validation.reference.shared_error_frame import (
     spread_of,
     with_outliers,
 )
+from bayes3d_ros.validation.reference.unknown_predictive import DrawnThing
 
 
 def sample_errors(
@@ -77,6 +78,35 @@ def sample_shared_depth(
 ) -> Float[np.ndarray, "H W"]:
     """A depth image of this scene, metres, in which every pixel returned. noise_error: pixels' own noise is so many
     times what the errors say; whole_waves: waves are a Gaussian process, not its approximation."""
+    frame, edge = _frame_of(scene, rays, errors, amplitudes, limits, noise_error)
+    return _returns(rng, scene, frame, edge, (scene.label >= OBJECT) & ~edge, whole_waves)
+
+
+def sample_depth_with_unknown(
+    rng: np.random.Generator,
+    scene: RenderedScene,
+    rays: PinholeRays,
+    errors: TrueErrors,
+    amplitudes: Amplitudes,
+    limits: DepthRange,
+    unknown: Bool[np.ndarray, "H W"],
+) -> Float[np.ndarray, "H W"]:
+    """The same with an unknown thing in front of the scene. unknown: its pixels."""
+    frame, edge = _frame_of(scene, rays, errors, amplitudes, limits, 1.0)
+    returns = _returns(rng, scene, frame, edge, (scene.label >= OBJECT) & ~edge & ~unknown, False)
+    DrawnThing(rng, scene, frame).draw(unknown, returns)
+    return returns
+
+
+def _frame_of(
+    scene: RenderedScene,
+    rays: PinholeRays,
+    errors: TrueErrors,
+    amplitudes: Amplitudes,
+    limits: DepthRange,
+    noise_error: float,
+) -> tuple[ErrorFrame, Bool[np.ndarray, "H W"]]:
+    """What all returns share, and the pixels whose windows show several surfaces."""
     depth, label, _ = scene
     spread = spread_of(scene)
     outlines = lost_mass(depth, label, rays.focal, margin_of(errors, spread), limits.far, float(amplitudes.edge_share))
@@ -91,20 +121,32 @@ def sample_shared_depth(
         outlines.reach,
         outlines.front,
     )
+    return frame, outlines.edge
+
+
+def _returns(
+    rng: np.random.Generator,
+    scene: RenderedScene,
+    frame: ErrorFrame,
+    edge: Bool[np.ndarray, "H W"],
+    of_cells: Bool[np.ndarray, "H W"],
+    whole_waves: bool,
+) -> Float[np.ndarray, "H W"]:
+    """of_cells: pixels of objects' cells."""
+    depth, label, _ = scene
     seen = np.full(depth.shape, np.nan)
-    edge = outlines.edge
     table = (label == TABLE) & ~edge
     rows, columns = (np.arange(n) // frame.block for n in depth.shape)
-    offset = errors.table * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns]
+    offset = frame.errors.table * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns]
     seen[table] = (depth + offset + frame.noise * rng.standard_normal(depth.shape))[table]
     objects, shared = seen.copy(), depth.copy()
-    for k in np.unique(label[(label >= OBJECT) & ~edge]):
-        cells = DrawnCells(rng, scene, (label == k) & ~edge, errors.scale[k - OBJECT], frame, whole_waves)
+    for k in np.unique(label[of_cells]):
+        cells = DrawnCells(rng, scene, (label == k) & of_cells, frame.errors.scale[k - OBJECT], frame, whole_waves)
         cells.draw(objects)
         v, u = np.nonzero(label == k)
         shared[v, u] += cells.shared_error_at(v, u)
     seen[edge] = _edge_inliers(rng, scene._replace(depth=shared), edge, frame)
-    return np.where((label >= OBJECT) & ~edge, objects, with_outliers(rng, seen, frame))
+    return np.where(of_cells, objects, with_outliers(rng, seen, frame))
 
 
 def _edge_inliers(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
@@ -46,10 +46,10 @@ from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
 from bayes3d_ros.validation.reference.prior_predictive import DepthRange
 from bayes3d_ros.validation.reference.shared_error_frame import PinholeRays, RenderedScene, TrueErrors, lost_mass
-from bayes3d_ros.validation.reference.shared_error_predictive import sample_shared_depth
+from bayes3d_ros.validation.reference.shared_error_predictive import sample_depth_with_unknown, sample_shared_depth
 
 
-class TableView(NamedTuple):
+class ViewOfTable(NamedTuple):
     """A camera that looks at the table's middle."""
 
     camera: Intrinsics
@@ -57,7 +57,7 @@ class TableView(NamedTuple):
     elevation: float  # radians, of the view below the horizon
 
 
-SHARED_VIEW = TableView(Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120), 0.85, np.radians(60))  # of a D435
+SHARED_VIEW = ViewOfTable(Intrinsics(153.75, 153.75, 79.5, 59.5, 160, 120), 0.85, np.radians(60))  # of a D435
 SHARED_SETTINGS = ParserSettings(
     max_objects=3,
     count_ratio=1.0,
@@ -103,7 +103,7 @@ class SharedPosterior(NamedTuple):
 
 
 def shared_problem(
-    library: Library, settings: ParserSettings = SHARED_SETTINGS, view: TableView = SHARED_VIEW
+    library: Library, settings: ParserSettings = SHARED_SETTINGS, view: ViewOfTable = SHARED_VIEW
 ) -> SharedProblem:
     """The library on a table seen from above."""
     camera, distance, elevation = view
@@ -156,11 +156,11 @@ def model_of(image: ScoredImage, problem: SharedProblem, known: TrueErrors | Non
 def rendered(objects: Placement, number: int, problem: SharedProblem) -> RenderedScene:
     """The first `number` of objects [M] on the table, as the sampler draws them."""
     one = jax.tree.map(lambda a: np.asarray(a)[None], objects)
-    depth, label = _layers(one, np.array([number]), problem)
+    depth, label = layers(one, np.array([number]), problem)
     return RenderedScene(depth[0], label[0], problem.bare)
 
 
-def _layers(
+def layers(
     objects: Placement, number: Int[np.ndarray, "N"], problem: SharedProblem
 ) -> tuple[Float[np.ndarray, "N H W"], Int[np.ndarray, "N H W"]]:
     """Depth and labels of scenes of `number` of objects [N, M] each."""
@@ -189,11 +189,23 @@ def simulate_shared_image(
     return image_of(depth, problem)
 
 
+def simulate_image_with_unknown(
+    rng: np.random.Generator,
+    scene: RenderedScene,
+    errors: TrueErrors,
+    unknown: Bool[np.ndarray, "H W"],
+    problem: SharedProblem,
+) -> ScoredImage:
+    """The same with an unknown thing in front of the scene. unknown: its pixels."""
+    given = problem.rays, errors, problem.amplitudes, problem.limits
+    return image_of(sample_depth_with_unknown(rng, scene, *given, unknown), problem)
+
+
 def log_masses(
     objects: Placement, number: Int[np.ndarray, "N"], margin: Float[np.ndarray, "H W"], problem: SharedProblem
 ) -> Float[np.ndarray, "N"]:
     """log of the density's integral over images of scenes of `number` of objects [N, M]; 0 of the empty table."""
-    depth, label = _layers(objects, number, problem)
+    depth, label = layers(objects, number, problem)
     edge_share, far = float(problem.amplitudes.edge_share), problem.limits.far
     lost = lost_mass(depth, label, problem.rays.focal, margin, far, edge_share).lost
     return np.log1p(lost).sum((-2, -1))

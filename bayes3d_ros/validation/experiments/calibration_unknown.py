@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Simulation-based calibration of the sampler where something unknown may stand on the table: a small problem, whose
+unknown things are drawn from their own prior (`validation/reference/unknown_predictive.py`).
+
+Two types, up to two known objects, an image of 48 x 36. An unknown thing stands, or lies, or floats anywhere in front
+of the scene with probability 1/2, and may hide known objects. The sampler is given sigma and p_outlier, few outliers:
+with more, many images would have unknown regions that are no things, which are not drawn.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bayes3d_ros.geometry.camera import Intrinsics
+from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.scored_image import ScoredImage
+from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
+from bayes3d_ros.likelihood.slow_pixel_kinds import kinds_of_pixels, mask_nats
+from bayes3d_ros.parsing.observe import Observation
+from bayes3d_ros.parsing.posterior_constants import LEAST_THING
+from bayes3d_ros.parsing.table_fit import SeenTable
+from bayes3d_ros.parsing.unknown_things import find_things
+from bayes3d_ros.settings import ParserSettings
+from bayes3d_ros.validation.experiments import Row, Step, row_step
+from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, PROBABILITIES, WANTED, line, ranked
+from bayes3d_ros.validation.experiments.calibration import summary as summary_of
+from bayes3d_ros.validation.experiments.calibration_plot import plot as plot_of
+from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples, small_library
+from bayes3d_ros.validation.reference.prior_predictive import sample_scene
+from bayes3d_ros.validation.reference.shared_error_frame import RenderedScene, TrueErrors
+from bayes3d_ros.validation.reference.shared_error_predictive import sample_errors
+from bayes3d_ros.validation.reference.shared_error_problem import (
+    SharedProblem,
+    ViewOfTable,
+    layers,
+    log_likelihood_of,
+    model_of,
+    rendered,
+    run_shared_sampler,
+    shared_problem,
+    simulate_image_with_unknown,
+)
+from bayes3d_ros.validation.reference.unknown_predictive import outline_sides, sample_outline
+from bayes3d_ros.validation.statistics.ranks import brier
+
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
+
+SCENES, QUICK_SCENES = 500, 60
+SEED = 51
+VIEW = ViewOfTable(Intrinsics(75.0, 75.0, 23.5, 17.5, 48, 36), 0.6, np.radians(60))
+SETTINGS = ParserSettings(
+    max_objects=2,
+    count_ratio=1.0,
+    table_width=0.3,
+    table_depth=0.3,
+    near=0.4,
+    far=0.9,  # behind the farthest of the table in sight
+    unknown=True,
+    unknown_probability=0.5,
+    outline_sigma=0.0,  # added after the weights, no part of the model
+    particles=192,
+)
+SIGMAS, OUTLIERS = (2e-4, 3e-3), (0.0, 1e-3)  # metres, shares: ends of the priors of truths
+LEAST_PIXELS = int(np.ceil(LEAST_THING * (VIEW.camera.fx / SETTINGS.near) ** 2))  # fewer were no thing if it is near
+_TOLD = ("sigma", "p_outlier")  # to the sampler: not ranked
+
+
+class UnknownImage(NamedTuple):
+    """An image of the model, with something unknown in it or not."""
+
+    image: ScoredImage
+    unknown: Bool[np.ndarray, "H W"]
+    drawn: int  # images until this one
+
+
+def notes(quick: bool) -> list[str]:
+    """What the problem is not."""
+    return [
+        "every pixel returned; the sampler is given sigma and p_outlier",
+        "unknown things lie within the image; none touches an object in depth and in the image",
+    ]
+
+
+def count(quick: bool) -> int:
+    """How many scenes there are."""
+    return QUICK_SCENES if quick else SCENES
+
+
+def steps(quick: bool) -> Iterator[Step]:
+    """A row a scene. Scene k is the same whatever their number."""
+    problem = unknown_problem()
+    for k in range(count(quick)):
+        yield row_step(scene_row, k, problem)
+
+
+def unknown_problem() -> SharedProblem:
+    """A brick and a mug on a small table."""
+    return shared_problem(small_library(), SETTINGS, VIEW)
+
+
+def scene_row(k: int, problem: SharedProblem) -> Row:
+    """Draw scene k and its image, sample the posterior, and rank the truth in it."""
+    scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SEED), k))
+    rng, drawn = np.random.default_rng((SEED, k)), np.random.default_rng((SEED, k, 1))
+    log_count = problem.log_count + np.arange(len(problem.log_count)) * np.log1p(-problem.settings.unknown_probability)
+    objects, number = sample_scene(scene_key, log_count, problem.library, problem.table)
+    errors = sample_errors(drawn, problem.amplitudes, SIGMAS, OUTLIERS, problem.settings.max_objects)
+    something = bool(drawn.random() < 0.5)
+    found = unknown_image(drawn, rendered(objects, number, problem), errors, something, problem)
+    model = model_of(found.image, problem, errors)
+    start = time.perf_counter()
+    samples = run_shared_sampler(sample_key, found.image, model, problem).samples
+    samples, some = with_things(samples, found.image, jax.device_get(model.image), problem)
+    seconds = time.perf_counter() - start
+    noise = (float(np.float32(value)) for value in (errors.sigma, errors.p_outlier))  # as samples hold them
+    truth = {"n": number, **dict(zip(_TOLD, noise, strict=True))}
+    truth["log_likelihood"] = log_likelihood_of(objects, number, found.image, model, problem)
+    row = ranked(k, truth, objects, samples, int(problem.library.num_types), rng)
+    for name in _TOLD:
+        row["rank"][name] = row["width_90"][name] = None
+    share = float(samples.weight[some].sum())
+    row |= {"unknown": int(something), "p_unknown": [round(1 - share, 6), round(share, 6)]}
+    row |= {"pixels": int(found.unknown.sum()), "sides": outline_sides(found.unknown), "drawn": found.drawn}
+    return row | {"seconds": round(seconds, 3)}
+
+
+def unknown_image(
+    rng: np.random.Generator, scene: RenderedScene, errors: TrueErrors, something: bool, problem: SharedProblem
+) -> UnknownImage:
+    """An image of the scene, with something unknown in front of it or not; drawn again where noise makes other unknown
+    regions, or depth goes on from the thing to an object."""
+    none, drawn = np.zeros(problem.bare.shape, bool), 0
+    while True:
+        drawn += 1
+        mask = sample_outline(rng, none.shape, LEAST_PIXELS) if something else none
+        image = simulate_image_with_unknown(rng, scene, errors, mask, problem)
+        shared = jax.device_get(model_of(image, problem, errors).image)
+        kinds = kinds_of_pixels(scene.depth, scene.label, image, shared)
+        seamless = mask_nats(kinds.unknown, np.zeros_like(kinds.of_object), image)
+        if (kinds.unknown == mask).all() and mask_nats(kinds.unknown, kinds.of_object, image) == seamless:
+            return UnknownImage(image, mask, drawn)
+
+
+def with_things(
+    samples: Samples, image: ScoredImage, errors: SharedErrorImage, problem: SharedProblem
+) -> tuple[Samples, Bool[np.ndarray, "S"]]:
+    """The samples weighted with unknown things as `SceneParser` does it, and which of them hold any."""
+    settings = problem.settings
+    kept = samples.weight > np.exp(-NEGLIGIBLE) * samples.weight.max()
+    scenes, _ = layers(jax.tree.map(lambda a: a[kept], samples.objects), samples.number[kept], problem)
+    log_prior = float(np.log(settings.count_ratio * settings.unknown_probability))
+    things = find_things(scenes, _observation(image, errors, problem), log_prior, 10, False, 0)
+    log_weight = np.full(len(samples.weight), -np.inf)
+    log_weight[kept] = np.log(samples.weight[kept]) + things.log_weight
+    log_weight += samples.number * np.log1p(-settings.unknown_probability)
+    weight = np.exp(log_weight - log_weight.max())
+    some = np.zeros(len(weight), bool)
+    some[kept] = [len(held) > 0 for held in things.held]
+    return samples._replace(weight=weight / weight.sum()), some
+
+
+def _observation(image: ScoredImage, errors: SharedErrorImage, problem: SharedProblem) -> Observation:
+    """What is looked at for unknown things."""
+    T = np.asarray(problem.table.T_camera_table, float)
+    nothing: Float[np.ndarray, "3"] = np.zeros(3)
+    return Observation(
+        image,
+        errors,
+        problem.table,
+        problem.camera,
+        np.asarray(image.depth),
+        np.full(problem.bare.shape, IN_WORKSPACE),
+        SeenTable(T, nothing, nothing, nothing),
+        1.0,
+        [],
+    )
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """As that of `calibration`, with the test of p(unknown) among the tests; `uncertain` is the share of scenes whose
+    p(unknown) is neither below 0.001 nor above 0.999."""
+    told = summary_of(rows)
+    p, outcomes = np.array([row["p_unknown"] for row in rows]), np.array([row["unknown"] for row in rows])
+    test = brier(p, outcomes, np.array([row["size"]["n"] for row in rows]))
+    told["p(unknown)"] = {"scenes": len(rows)} | {k: float(f"{v:.4g}") for k, v in test._asdict().items()}
+    number, smallest = told["tests"]["number"] + 1, min(told["tests"]["smallest_p"], test.p_value)
+    told["tests"] |= {"number": number, "rejected_below": float(f"{LEVEL / number:.4g}"), "smallest_p": smallest}
+    told["calibrated"] = bool(smallest >= LEVEL / number and not told["tests"]["not_covered"])
+    told["uncertain"] = round(float(np.mean((p[:, 1] > 0.001) & (p[:, 1] < 0.999))), 4)
+    told["size_of_pose"] = float(np.median([row["size"]["x"] for row in rows if "x" in row["size"]] or [0.0]))
+    return told
+
+
+def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write calibration-unknown.png."""
+    ranked_latents = [name for name in LATENTS if name not in _TOLD]
+    return plot_of(rows, folder, "calibration-unknown", ranked_latents, (*PROBABILITIES, "unknown"))
