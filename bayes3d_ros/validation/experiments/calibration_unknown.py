@@ -22,6 +22,7 @@ from bayes3d_ros.likelihood.density import IN_WORKSPACE
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.likelihood.slow_pixel_kinds import kinds_of_pixels, mask_nats
+from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING
 from bayes3d_ros.parsing.table_fit import SeenTable
@@ -33,7 +34,7 @@ from bayes3d_ros.validation.experiments.calibration import summary as summary_of
 from bayes3d_ros.validation.experiments.calibration_plot import plot as plot_of
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples, small_library
 from bayes3d_ros.validation.reference.prior_predictive import sample_scene
-from bayes3d_ros.validation.reference.shared_error_frame import RenderedScene, TrueErrors
+from bayes3d_ros.validation.reference.shared_error_frame import TrueErrors
 from bayes3d_ros.validation.reference.shared_error_predictive import sample_errors
 from bayes3d_ros.validation.reference.shared_error_problem import (
     SharedProblem,
@@ -71,12 +72,15 @@ LEAST_PIXELS = int(np.ceil(LEAST_THING * (VIEW.camera.fx / SETTINGS.near) ** 2))
 _TOLD = ("sigma", "p_outlier")  # to the sampler: not ranked
 
 
-class UnknownImage(NamedTuple):
-    """An image of the model, with something unknown in it or not."""
+class DrawnScene(NamedTuple):
+    """A scene of the model, something unknown in it or not, and an image."""
 
+    objects: Placement  # [M]
+    number: int  # of them that are meant
+    errors: TrueErrors
+    unknown: Bool[np.ndarray, "H W"]  # pixels of the unknown thing; none where there is none
     image: ScoredImage
-    unknown: Bool[np.ndarray, "H W"]
-    drawn: int  # images until this one
+    trials: int  # scenes until this one
 
 
 def notes(quick: bool) -> list[str]:
@@ -106,45 +110,45 @@ def unknown_problem() -> SharedProblem:
 
 def scene_row(k: int, problem: SharedProblem) -> Row:
     """Draw scene k and its image, sample the posterior, and rank the truth in it."""
-    scene_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(SEED), k))
-    rng, drawn = np.random.default_rng((SEED, k)), np.random.default_rng((SEED, k, 1))
-    log_count = problem.log_count + np.arange(len(problem.log_count)) * np.log1p(-problem.settings.unknown_probability)
-    objects, number = sample_scene(scene_key, log_count, problem.library, problem.table)
-    errors = sample_errors(drawn, problem.amplitudes, SIGMAS, OUTLIERS, problem.settings.max_objects)
-    something = bool(drawn.random() < 0.5)
-    found = unknown_image(drawn, rendered(objects, number, problem), errors, something, problem)
-    model = model_of(found.image, problem, errors)
+    drawn = drawn_scene(k, problem)
+    model = model_of(drawn.image, problem, drawn.errors)
     start = time.perf_counter()
-    samples = run_shared_sampler(sample_key, found.image, model, problem).samples
-    samples, some = with_things(samples, found.image, jax.device_get(model.image), problem)
+    samples = run_shared_sampler(jax.random.fold_in(jax.random.key(SEED), k), drawn.image, model, problem).samples
+    samples, some = with_things(samples, drawn.image, jax.device_get(model.image), problem)
     seconds = time.perf_counter() - start
-    noise = (float(np.float32(value)) for value in (errors.sigma, errors.p_outlier))  # as samples hold them
-    truth = {"n": number, **dict(zip(_TOLD, noise, strict=True))}
-    truth["log_likelihood"] = log_likelihood_of(objects, number, found.image, model, problem)
-    row = ranked(k, truth, objects, samples, int(problem.library.num_types), rng)
+    noise = (float(np.float32(value)) for value in drawn.errors[:2])  # as samples hold them
+    truth = {"n": drawn.number, **dict(zip(_TOLD, noise, strict=True))}
+    truth["log_likelihood"] = log_likelihood_of(drawn.objects, drawn.number, drawn.image, model, problem)
+    types, rng = int(problem.library.num_types), np.random.default_rng((SEED, k))
+    row = ranked(k, truth, drawn.objects, samples, types, rng)
     for name in _TOLD:
         row["rank"][name] = row["width_90"][name] = None
     share = float(samples.weight[some].sum())
-    row |= {"unknown": int(something), "p_unknown": [round(1 - share, 6), round(share, 6)]}
-    row |= {"pixels": int(found.unknown.sum()), "sides": outline_sides(found.unknown), "drawn": found.drawn}
+    row |= {"unknown": int(drawn.unknown.any()), "p_unknown": [round(1 - share, 6), round(share, 6)]}
+    row |= {"pixels": int(drawn.unknown.sum()), "sides": outline_sides(drawn.unknown), "trials": drawn.trials}
     return row | {"seconds": round(seconds, 3)}
 
 
-def unknown_image(
-    rng: np.random.Generator, scene: RenderedScene, errors: TrueErrors, something: bool, problem: SharedProblem
-) -> UnknownImage:
-    """An image of the scene, with something unknown in front of it or not; drawn again where noise makes other unknown
-    regions, or depth goes on from the thing to an object."""
-    none, drawn = np.zeros(problem.bare.shape, bool), 0
+def drawn_scene(k: int, problem: SharedProblem) -> DrawnScene:
+    """Scene k and its image. Both are drawn again where other pixels than the thing's are unknown, which errors of the
+    table and outliers can do, or where depth goes on from the thing to an object."""
+    none = np.zeros(problem.bare.shape, bool)
+    most, rate = problem.settings.max_objects, problem.settings.unknown_probability
+    log_count = problem.log_count + np.arange(most + 1) * np.log1p(-rate)
+    trial = 0
     while True:
-        drawn += 1
-        mask = sample_outline(rng, none.shape, LEAST_PIXELS) if something else none
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(SEED + 1), k), trial)
+        rng = np.random.default_rng((SEED, k, trial))
+        objects, number = sample_scene(key, log_count, problem.library, problem.table)
+        scene = rendered(objects, number, problem)
+        errors = sample_errors(rng, problem.amplitudes, SIGMAS, OUTLIERS, most)
+        mask = sample_outline(rng, none.shape, LEAST_PIXELS) if rng.random() < 0.5 else none
         image = simulate_image_with_unknown(rng, scene, errors, mask, problem)
-        shared = jax.device_get(model_of(image, problem, errors).image)
-        kinds = kinds_of_pixels(scene.depth, scene.label, image, shared)
-        seamless = mask_nats(kinds.unknown, np.zeros_like(kinds.of_object), image)
-        if (kinds.unknown == mask).all() and mask_nats(kinds.unknown, kinds.of_object, image) == seamless:
-            return UnknownImage(image, mask, drawn)
+        kinds = kinds_of_pixels(scene.depth, scene.label, image, jax.device_get(model_of(image, problem, errors).image))
+        with_seams, without = (mask_nats(kinds.unknown, known, image) for known in (kinds.of_object, none))
+        if (kinds.unknown == mask).all() and with_seams == without:
+            return DrawnScene(objects, number, errors, mask, image, trial + 1)
+        trial += 1
 
 
 def with_things(

@@ -5,8 +5,9 @@
 
 What is not as the density has it:
 - a thing lies within the image, since sides at the image's border cost nothing and most outlines would lie there, and
-  is large enough to count as one (`LEAST_THING`). Smaller regions of unknown returns are not drawn, and images in which
-  noise makes some are drawn again; so are those with a seam, a side across which depth goes on to an object;
+  is large enough to count as one (`LEAST_THING`). Smaller regions of unknown returns are not drawn:
+  `calibration-unknown` draws a scene again if its image has some, or a seam, a side across which depth goes on from
+  the thing to an object;
 - a block that shows a thing and an object is a plane of the thing's returns alone, where the density has one of all.
 """
 
