@@ -79,7 +79,7 @@ def _nothing(problem):
 
 def test_what_is_drawn_is_what_is_unknown(problem):
     """No more and no less than the thing's pixels, and no seam."""
-    drawn = [calibration_unknown.drawn_scene(k, problem) for k in range(6)]
+    drawn = [calibration_unknown.drawn_scene(k, problem) for k in range(12)]
     for one in drawn:
         shared = jax.device_get(model_of(one.image, problem, one.errors).image)
         scene = rendered(one.objects, one.number, problem)
@@ -99,7 +99,7 @@ def test_a_row_tells_of_the_unknown_thing(problem, monkeypatch):
         return SharedPosterior(samples, np.zeros(8))
 
     monkeypatch.setattr(calibration_unknown, "run_shared_sampler", empty)
-    rows = [calibration_unknown.scene_row(k, problem) for k in range(4)]
+    rows = [calibration_unknown.scene_row(k, problem) for k in range(7, 12)]
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     assert {row["unknown"] for row in rows} == {0, 1}
     assert all(row["rank"]["sigma"] is None for row in rows)
