@@ -47,6 +47,10 @@ def plot(
     axes[1, 0].set_ylabel("share of ranks below, less uniform", color=INK)
     for axis, kind in zip(below.subplots(1, len(probabilities)), probabilities, strict=True):
         _reliability(axis, [row for row in rows if row[kind] is not None], kind)
+    below.suptitle(
+        f"How often predictions came true: ten bins, the number in each; grey: {_INSIDE:.0%} if they are right",
+        x=0.01, ha="left", fontsize=11, color=INK,
+    )  # fmt: skip
     path = folder / f"{name}.png"
     figure.savefig(path, dpi=100)
     return [path]
@@ -93,8 +97,6 @@ def _reliability(axis: Axes, rows: Sequence[Row], name: str) -> None:
     axis.set(xlim=(-0.04, 1.08), ylim=(-0.04, 1.04))
     axis.set_xlabel(f"p({name})", color=INK)
     axis.set_ylabel("share that came true", color=INK)
-    title = f"p({name}): ten bins, predictions in each; grey: {_INSIDE:.0%} if they are right"
-    axis.set_title(title, fontsize=10, color=INK, loc="left")
     _open_with_small_ticks(axis)
 
 
