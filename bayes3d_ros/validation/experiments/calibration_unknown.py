@@ -5,7 +5,9 @@ unknown things are drawn from their own prior (`validation/reference/unknown_pre
 
 Two types, up to two known objects, an image of 48 x 36. An unknown thing stands, or lies, or floats anywhere in front
 of the scene with probability 1/2, and may hide known objects. The sampler is given sigma and p_outlier, few outliers:
-with more, many images would have unknown regions that are no things, which are not drawn.
+with more, many images would have unknown regions that are no things, which are not drawn. Truths have the outlines'
+prior as a distribution, the sampler has exp(-`OUTLINE_NATS` L) of each, as it is shipped: this is far less than what a
+thing's returns tell, so p(unknown) is near 0 or 1.
 """
 
 import time
@@ -114,7 +116,7 @@ def scene_row(k: int, problem: SharedProblem) -> Row:
     model = model_of(drawn.image, problem, drawn.errors)
     start = time.perf_counter()
     samples = run_shared_sampler(jax.random.fold_in(jax.random.key(SEED), k), drawn.image, model, problem).samples
-    samples, some = with_things(samples, drawn.image, jax.device_get(model.image), problem)
+    samples, some = _with_things(samples, drawn.image, jax.device_get(model.image), problem)
     seconds = time.perf_counter() - start
     noise = (float(np.float32(value)) for value in drawn.errors[:2])  # as samples hold them
     truth = {"n": drawn.number, **dict(zip(_TOLD, noise, strict=True))}
@@ -151,7 +153,7 @@ def drawn_scene(k: int, problem: SharedProblem) -> DrawnScene:
         trial += 1
 
 
-def with_things(
+def _with_things(
     samples: Samples, image: ScoredImage, errors: SharedErrorImage, problem: SharedProblem
 ) -> tuple[Samples, Bool[np.ndarray, "S"]]:
     """The samples weighted with unknown things as `SceneParser` does it, and which of them hold any."""
