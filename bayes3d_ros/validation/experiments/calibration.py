@@ -167,9 +167,10 @@ def line(row: Row) -> str:
     )
 
 
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
+def summary(rows: Sequence[Row], probabilities: Sequence[str] = PROBABILITIES) -> dict[str, Any]:
     """For every latent: tests of its ranks, coverage of central intervals, and their mean width over that of the prior;
-    for number, type and face: the test of their probabilities; and whether all tests together find a fault."""
+    for number, type and face (`probabilities`): the test of their probabilities; and whether all tests together find a
+    fault."""
     told: dict[str, Any] = {
         "scenes": len(rows),
         "seconds": round(float(np.mean([row["seconds"] for row in rows])), 3),
@@ -199,18 +200,24 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         low, high = np.quantile([row["truth"][name] for row in own], (0.05, 0.95))
         width = np.mean([row["width_90"][name] for row in own])
         told[name] |= _rounded_values({"width": float(width / max(high - low, 1e-9))})
-    for name in PROBABILITIES:
+    for name in probabilities:
         own = [row for row in rows if row[name] is not None]
         if own:
-            sizes = [row["size"]["n" if name == "n" else "x"] for row in own]
-            probabilities, outcomes = ([row[key] for row in own] for key in (f"p_{name}", name))
-            test = brier(np.array(probabilities), np.array(outcomes), np.array(sizes))
+            sizes = [row["size"]["x" if name in ("type", "face") else "n"] for row in own]
+            said, outcomes = ([row[key] for row in own] for key in (f"p_{name}", name))
+            test = brier(np.array(said), np.array(outcomes), np.array(sizes))
             p_values.append(test.p_value)
             told[f"p({name})"] = {"scenes": len(own), **_rounded_values(test._asdict())}
     told["tests"] = {"number": len(p_values), "rejected_below": LEVEL / len(p_values), "smallest_p": min(p_values)}
     told["tests"] = {**_rounded_values(told["tests"]), "not_covered": uncovered}
     told["calibrated"] = bool(min(p_values) >= LEVEL / len(p_values) and not uncovered)
     return told
+
+
+def size_of_pose(rows: Sequence[Row]) -> float | None:
+    """Median number of equally weighted samples behind a pose's ranks; None where there is no object."""
+    sizes = [row["size"]["x"] for row in rows if "x" in row["size"]]
+    return float(np.median(sizes)) if sizes else None
 
 
 def _rounded_values(numbers: dict[str, float]) -> dict[str, float]:

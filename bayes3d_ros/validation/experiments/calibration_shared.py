@@ -19,7 +19,16 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.validation.bench.benchmark import ten_ycb_types
 from bayes3d_ros.validation.experiments import Row, Step, row_step
-from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, WANTED, line, plot, ranked
+from bayes3d_ros.validation.experiments.calibration import (
+    HEADER,
+    LATENTS,
+    LEVEL,
+    WANTED,
+    line,
+    plot,
+    ranked,
+    size_of_pose,
+)
 from bayes3d_ros.validation.experiments.calibration import summary as summary_of
 from bayes3d_ros.validation.reference.prior_predictive import sample_scene
 from bayes3d_ros.validation.reference.shared_error_frame import RenderedScene, TrueErrors
@@ -113,7 +122,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """As that of `calibration`; the same of the normalised density; sigma and p_outlier given an empty table; and
     whether the scenes' own latents, all but sigma and p_outlier, are calibrated under either."""
     told = summary_of(rows)
-    told["size_of_pose"] = _median([row["size"]["x"] for row in rows if "x" in row["size"]])
+    told["size_of_pose"] = size_of_pose(rows)
     normalised = summary_of([row | row["normalised"] for row in rows])
     told["normalised"] = {name: value for name, value in normalised.items() if name not in ("scenes", "seconds")}
     given = [row["given_scene"] for row in rows if row["given_scene"] is not None]
@@ -127,10 +136,6 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     told["scenes_calibrated"] = _scenes_calibrated(told)
     told["normalised"]["scenes_calibrated"] = _scenes_calibrated(normalised)
     return told
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if values else None
 
 
 def _scenes_calibrated(told: dict[str, Any]) -> bool:

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.likelihood.density import IN_WORKSPACE
+from bayes3d_ros.likelihood.image_model import SharedErrors
 from bayes3d_ros.likelihood.scored_image import ScoredImage
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
 from bayes3d_ros.likelihood.slow_pixel_kinds import kinds_of_pixels, mask_nats
@@ -31,7 +32,15 @@ from bayes3d_ros.parsing.table_fit import SeenTable
 from bayes3d_ros.parsing.unknown_things import find_things
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.experiments import Row, Step, row_step
-from bayes3d_ros.validation.experiments.calibration import HEADER, LATENTS, LEVEL, PROBABILITIES, WANTED, line, ranked
+from bayes3d_ros.validation.experiments.calibration import (
+    HEADER,
+    LATENTS,
+    PROBABILITIES,
+    WANTED,
+    line,
+    ranked,
+    size_of_pose,
+)
 from bayes3d_ros.validation.experiments.calibration import summary as summary_of
 from bayes3d_ros.validation.experiments.calibration_plot import plot as plot_of
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples, small_library
@@ -50,7 +59,6 @@ from bayes3d_ros.validation.reference.shared_error_problem import (
     simulate_image_with_unknown,
 )
 from bayes3d_ros.validation.reference.unknown_predictive import outline_sides, sample_outline
-from bayes3d_ros.validation.statistics.ranks import brier
 
 __all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -72,6 +80,7 @@ SETTINGS = ParserSettings(
 SIGMAS, OUTLIERS = (2e-4, 3e-3), (0.0, 1e-3)  # metres, shares: ends of the priors of truths
 LEAST_PIXELS = int(np.ceil(LEAST_THING * (VIEW.camera.fx / SETTINGS.near) ** 2))  # fewer were no thing if it is near
 _TOLD = ("sigma", "p_outlier")  # to the sampler: not ranked
+_PROBABILITIES = (*PROBABILITIES, "unknown")
 
 
 class DrawnScene(NamedTuple):
@@ -82,6 +91,7 @@ class DrawnScene(NamedTuple):
     errors: TrueErrors
     unknown: Bool[np.ndarray, "H W"]  # pixels of the unknown thing; none where there is none
     image: ScoredImage
+    model: SharedErrors
     trials: int  # scenes until this one
 
 
@@ -113,7 +123,7 @@ def unknown_problem() -> SharedProblem:
 def scene_row(k: int, problem: SharedProblem) -> Row:
     """Draw scene k and its image, sample the posterior, and rank the truth in it."""
     drawn = drawn_scene(k, problem)
-    model = model_of(drawn.image, problem, drawn.errors)
+    model = drawn.model
     start = time.perf_counter()
     samples = run_shared_sampler(jax.random.fold_in(jax.random.key(SEED), k), drawn.image, model, problem).samples
     samples, some = _with_things(samples, drawn.image, jax.device_get(model.image), problem)
@@ -146,10 +156,11 @@ def drawn_scene(k: int, problem: SharedProblem) -> DrawnScene:
         errors = sample_errors(rng, problem.amplitudes, SIGMAS, OUTLIERS, most)
         mask = sample_outline(rng, none.shape, LEAST_PIXELS) if rng.random() < 0.5 else none
         image = simulate_image_with_unknown(rng, scene, errors, mask, problem)
-        kinds = kinds_of_pixels(scene.depth, scene.label, image, jax.device_get(model_of(image, problem, errors).image))
+        model = model_of(image, problem, errors)
+        kinds = kinds_of_pixels(scene.depth, scene.label, image, jax.device_get(model.image))
         with_seams, without = (mask_nats(kinds.unknown, known, image) for known in (kinds.of_object, none))
         if (kinds.unknown == mask).all() and with_seams == without:
-            return DrawnScene(objects, number, errors, mask, image, trial + 1)
+            return DrawnScene(objects, number, errors, mask, image, model, trial + 1)
         trial += 1
 
 
@@ -192,19 +203,12 @@ def _observation(image: ScoredImage, errors: SharedErrorImage, problem: SharedPr
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """As that of `calibration`, with the test of p(unknown) among the tests; `uncertain` is the share of scenes whose
     p(unknown) is neither below 0.001 nor above 0.999."""
-    told = summary_of(rows)
-    p, outcomes = np.array([row["p_unknown"] for row in rows]), np.array([row["unknown"] for row in rows])
-    test = brier(p, outcomes, np.array([row["size"]["n"] for row in rows]))
-    told["p(unknown)"] = {"scenes": len(rows)} | {k: float(f"{v:.4g}") for k, v in test._asdict().items()}
-    number, smallest = told["tests"]["number"] + 1, min(told["tests"]["smallest_p"], test.p_value)
-    told["tests"] |= {"number": number, "rejected_below": float(f"{LEVEL / number:.4g}"), "smallest_p": smallest}
-    told["calibrated"] = bool(smallest >= LEVEL / number and not told["tests"]["not_covered"])
-    told["uncertain"] = round(float(np.mean((p[:, 1] > 0.001) & (p[:, 1] < 0.999))), 4)
-    told["size_of_pose"] = float(np.median([row["size"]["x"] for row in rows if "x" in row["size"]] or [0.0]))
-    return told
+    told, p = summary_of(rows, _PROBABILITIES), np.array([row["p_unknown"][1] for row in rows])
+    told["uncertain"] = round(float(np.mean((p > 0.001) & (p < 0.999))), 4)
+    return told | {"size_of_pose": size_of_pose(rows)}
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write calibration-unknown.png."""
     ranked_latents = [name for name in LATENTS if name not in _TOLD]
-    return plot_of(rows, folder, "calibration-unknown", ranked_latents, (*PROBABILITIES, "unknown"))
+    return plot_of(rows, folder, "calibration-unknown", ranked_latents, _PROBABILITIES)

@@ -34,6 +34,10 @@ class DepthRange(NamedTuple):
         """Outliers have the density `outlier_scale` z^2."""
         return 3 / (self.far**3 - self.near**3)
 
+    def sample_outliers(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+        """Depths of returns that lie anywhere, metres: uniform in the frustum's volume."""
+        return np.cbrt(self.near**3 + rng.random(shape) * (self.far**3 - self.near**3))
+
 
 def sample_scene(
     key: PRNGKeyArray, log_count: Float[np.ndarray, "M+1"], library: LibraryArrays, table: Table
@@ -114,8 +118,7 @@ def sample_depth(
         jnp.asarray(rng.random(surface.shape), jnp.float32),
         window,
     )
-    near3, far3 = limits.near**3, limits.far**3
-    anywhere = np.cbrt(near3 + rng.random(surface.shape) * (far3 - near3))
+    anywhere = limits.sample_outliers(rng, surface.shape)
     return np.where(empty | (rng.random(surface.shape) < p_outlier), anywhere, np.asarray(seen, np.float64))
 
 

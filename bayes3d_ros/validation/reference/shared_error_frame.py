@@ -77,7 +77,12 @@ def reference_depth(scene: RenderedScene) -> float:
 def spread_of(scene: RenderedScene) -> Float[np.ndarray, "H W"]:
     """Standard deviation of returns over that at the reference depth, as `shared_error_image` has it."""
     depth, reference = scene.depth, reference_depth(scene)
-    return np.sqrt(0.5 + 0.5 * (np.where(np.isfinite(depth), depth, reference) / reference) ** 4)
+    return spread_at(np.where(np.isfinite(depth), depth, reference), reference)
+
+
+def spread_at(depth: Float[np.ndarray, "*shape"], reference: float) -> Float[np.ndarray, "*shape"]:
+    """The same of returns at these depths, metres; reference: where it is 1."""
+    return np.sqrt(0.5 + 0.5 * (depth / reference) ** 4)
 
 
 def lost_mass(
@@ -110,9 +115,8 @@ def margin_of(errors: TrueErrors, spread: Float[np.ndarray, "H W"]) -> Float[np.
 
 def with_outliers(rng: np.random.Generator, inliers: np.ndarray, frame: ErrorFrame, at=np.s_[:]) -> np.ndarray:
     """Some of these returns lie anywhere. at: which pixels of the image these are."""
-    near, far = frame.limits
-    reach, front, p = frame.reach[at], np.maximum(frame.front[at], near), frame.errors.p_outlier
-    anywhere = np.cbrt(near**3 + rng.random(inliers.shape) * (far**3 - near**3))
+    reach, front, p = frame.reach[at], np.maximum(frame.front[at], frame.limits.near), frame.errors.p_outlier
+    anywhere = frame.limits.sample_outliers(rng, inliers.shape)
     share = LOST_SHARE * float(frame.amplitudes.edge_share) * (reach > 0)
     lost = (1 - p) * share * reach / LOST_DEPTH
     uniform = rng.random(inliers.shape) * (p + lost + (1 - p) * (1 - share))

@@ -27,6 +27,7 @@ from bayes3d_ros.validation.reference.shared_error_frame import (
     TrueErrors,
     margin_of,
     reference_depth,
+    spread_at,
     spread_of,
 )
 
@@ -126,12 +127,10 @@ class DrawnThing:
     def _returns(self, pixels: Int[np.ndarray, "K 2"], beside: list[_Block]):
         """Returns of a block, and their standard deviations; metres."""
         u, v = pixels.T
-        limits, errors, rays = self.frame.limits, self.frame.errors, self.frame.rays
+        errors, rays = self.frame.errors, self.frame.rays
         depth = self._plane(pixels, beside)
-        norm2 = 1 + rays.x[u] ** 2 + rays.y[v] ** 2
-        noise = errors.sigma * np.sqrt((0.5 + 0.5 * (depth / self.reference) ** 4) / norm2)
-        near3, far3 = limits.near**3, limits.far**3
-        anywhere = np.cbrt(near3 + self.rng.random(len(u)) * (far3 - near3))
+        noise = errors.sigma * spread_at(depth, self.reference) / np.sqrt(1 + rays.x[u] ** 2 + rays.y[v] ** 2)
+        anywhere = self.frame.limits.sample_outliers(self.rng, depth.shape)
         seen = depth + noise * self.rng.standard_normal(len(u))
         return np.where(self.rng.random(len(u)) < errors.p_outlier, anywhere, seen), noise
 
