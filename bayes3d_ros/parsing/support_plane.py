@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import ConvexHull, Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from bayes3d_ros.geometry.robust import geman_mcclure
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
@@ -22,6 +22,8 @@ from bayes3d_ros.parsing.posterior_constants import (
 )
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.posterior.types import ParseError
+
+_ROUNDING = 1e-9  # metres: whole columns of pixels lie on a side of the table's polygon that points to the camera
 
 
 class Plane(NamedTuple):
@@ -135,7 +137,7 @@ def workspace(
     if hull is None:
         raise ParseError("no table in sight: nothing is seen of its surface inside the table's area")
     over = np.zeros(candidate.shape, bool)
-    over[candidate] = hull.find_simplex(local[candidate][:, :2]) >= 0
+    over[candidate] = in_polygon(hull, local[candidate][:, :2])
     pieces, count = connected_pieces(candidate & ~flat, z_camera)
     stands = np.zeros(candidate.shape, bool)
     if count:
@@ -195,7 +197,12 @@ def connected_pieces(
     return np.where(risen, pieces[tuple(nearest)], 0) if count else pieces, count
 
 
-def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> Delaunay | None:
+def in_polygon(hull: ConvexHull, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
+    """Which points, in metres, lie in a convex polygon or on its border."""
+    return (points @ hull.equations[:, :2].T <= _ROUNDING - hull.equations[:, 2]).all(1)
+
+
+def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> ConvexHull | None:
     """The convex hull of the largest connected piece of the table's surface, grown by a margin and extended to
     below the camera: the lower edge of the image is not the edge of the table."""
     if len(surface) < 50:
@@ -214,6 +221,6 @@ def _support(surface: Float[np.ndarray, "N 2"], eye: Float[np.ndarray, "2"]) -> 
     ring = SUPPORT_MARGIN * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 16, endpoint=False)), np.sin(a)], 1)
     try:
         corners = surface[piece][ConvexHull(surface[piece]).vertices]
-        return Delaunay(np.concatenate([(corners[:, None] + ring).reshape(-1, 2), eye[None]]))
+        return ConvexHull(np.concatenate([(corners[:, None] + ring).reshape(-1, 2), eye[None]]))
     except (QhullError, ValueError):
         return None

@@ -75,10 +75,11 @@ def find_things(
     room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds. A thing whose
     middle lies outside the region is not counted."""
     rng = np.random.default_rng(seed)
+    part = before_the_table(seen)
     known: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
     for n, depth in enumerate(scenes):
-        mask = in_front(depth, seen)
+        mask = in_front(depth, seen, part)
         key = np.packbits(mask).tobytes()
         if key not in known:
             known[key] = _things(mask, seen)
@@ -100,15 +101,34 @@ def find_things(
     return ThingsOfScenes(held, log_weight)
 
 
-def in_front(depth: Float[np.ndarray, "H W"], seen: Observation) -> Bool[np.ndarray, "h w"]:
-    """Returns that stand in front of a scene by more than a margin, as the likelihood decides it."""
+def in_front(
+    depth: Float[np.ndarray, "H W"], seen: Observation, part: tuple[slice, slice] = (slice(None), slice(None))
+) -> Bool[np.ndarray, "h w"]:
+    """Returns that stand in front of a scene by more than a margin, as the likelihood decides it. part: of the image,
+    outside of which there are none (`before_the_table`)."""
     errors = seen.errors
     assert errors is not None
     height, width = seen.depth.shape
-    depth, bare = depth[:height, :width], np.asarray(seen.image.bare_depth)[:height, :width]
+    depth, bare, margin = (
+        np.asarray(a)[:height, :width][part] for a in (depth, seen.image.bare_depth, errors.table_margin)
+    )
     label = np.where(depth == bare, TABLE, np.where(np.isfinite(depth), OBJECT, NOTHING))
-    front = stands_in_front(seen.depth, depth, label, errors.table_margin[:height, :width])
+    front = np.zeros(seen.depth.shape, bool)
+    front[part] = stands_in_front(seen.depth[part], depth, label, margin)
     return (seen.pixel_class == IN_WORKSPACE) & front
+
+
+def before_the_table(seen: Observation) -> tuple[slice, slice]:
+    """Rows and columns of the image that hold all returns in front of the bare table, and a pixel about them. No scene
+    is behind the bare table, so that no other return stands in front of one."""
+    errors = seen.errors
+    assert errors is not None
+    height, width = seen.depth.shape
+    bare, margin = (np.asarray(a)[:height, :width] for a in (seen.image.bare_depth, errors.table_margin))
+    v, u = np.nonzero((seen.pixel_class == IN_WORKSPACE) & (seen.depth < bare - margin))
+    if len(v) == 0:
+        return slice(0), slice(0)
+    return slice(max(v.min() - 1, 0), v.max() + 2), slice(max(u.min() - 1, 0), u.max() + 2)
 
 
 def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownThing, ...]:

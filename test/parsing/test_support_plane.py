@@ -4,10 +4,18 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull, Delaunay
 
 from bayes3d_ros.geometry.camera import Intrinsics, unproject
 from bayes3d_ros.likelihood.density import BEYOND, IN_WORKSPACE, NO_RETURN
-from bayes3d_ros.parsing.support_plane import depth_of_table, find_plane, table_frame, usable_share, workspace
+from bayes3d_ros.parsing.support_plane import (
+    depth_of_table,
+    find_plane,
+    in_polygon,
+    table_frame,
+    usable_share,
+    workspace,
+)
 from bayes3d_ros.posterior.types import ParseError
 
 CAMERA = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
@@ -107,3 +115,12 @@ def test_the_share_of_usable_pixels_is_of_those_that_look_at_the_table():
     looks_up = np.diag([1.0, -1.0, -1.0, 1.0])  # the table above the camera, seen from below
     looks_up[1, 3] = -1.0
     assert np.isnan(usable_share(pixel_class, rays, looks_up, size, 5.0))
+
+
+def test_points_of_a_polygon_are_those_of_its_triangles():
+    rng = np.random.default_rng(6)
+    for corners in (3, 4, 40):
+        polygon, points = rng.normal(size=(corners, 2)), rng.normal(size=(5000, 2))
+        expected = Delaunay(polygon).find_simplex(points) >= 0
+        assert 20 < expected.sum() < 4980
+        np.testing.assert_array_equal(in_polygon(ConvexHull(polygon), points), expected)

@@ -12,8 +12,9 @@ from fixtures.plain_tables import at, plain_frame
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import UNKNOWN, Library
 from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing.observe import observe
 from bayes3d_ros.parsing.parser import SceneParser
-from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, drawn_box
+from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, before_the_table, drawn_box, in_front
 from bayes3d_ros.settings import ParserSettings
 
 SETTINGS = ParserSettings(particles=48, max_objects=4, table_width=0.8, table_depth=0.8)
@@ -45,6 +46,19 @@ def test_a_known_and_an_unknown_thing(both, library):
     assert all(o.probability > 0.99 and o.type_probabilities[o.type] > 0.99 for o in both.objects)
     assert both.num_objects[2] > 0.8 and both.num_unknown[1] > 0.99
     assert both.unexplained == () and both.warnings == ()
+
+
+def test_returns_in_front_of_a_scene_are_looked_for_in_a_part_of_the_image():
+    rng, seen = np.random.default_rng(0), observe(plain_frame(BRICK, BALL), SETTINGS)
+    height, width = seen.depth.shape
+    bare = np.asarray(seen.image.bare_depth)[:height, :width]
+    part = before_the_table(seen)
+    assert seen.depth[part].size < 0.5 * seen.depth.size
+    for _ in range(20):  # of all, some, or no returns a surface of an object, somewhere near
+        object_depth = seen.depth + rng.normal(0.0, 0.02, seen.depth.shape)
+        scene = np.where(rng.uniform(size=bare.shape) < rng.uniform(), np.fmin(bare, object_depth), bare)
+        np.testing.assert_array_equal(in_front(scene, seen, part), in_front(scene, seen))
+    assert in_front(bare, seen, part).sum() > 100
 
 
 def test_an_unknown_thing_has_an_upright_box_on_the_table(both):
