@@ -26,7 +26,7 @@ from bayes3d_ros.validation.simulate.mug_images import (
 from bayes3d_ros.validation.simulate.random_scenes import REALSENSE
 from bayes3d_ros.validation.simulate.shared_error_frames import PlacedObject
 from bayes3d_ros.validation.simulate.small_images import clean_depth
-from bayes3d_ros.validation.statistics.yaw_samples import kernel_density, weighted_yaws, yaw_scores
+from bayes3d_ros.validation.statistics.yaw_samples import circular_sd, kernel_density, weighted_yaws, yaw_scores
 
 YAWS = 90
 
@@ -69,6 +69,23 @@ def test_the_posterior_is_flat_where_the_handle_is_hidden_and_sharp_where_it_is_
     assert axis[aside.argmax()] == 0 and aside.max() > 0.99
     assert entropy(np.full(YAWS, 1 / YAWS)) == pytest.approx(np.log(2 * np.pi))
     assert entropy(aside) < entropy(away) < np.log(2 * np.pi)
+
+
+def test_the_handle_is_in_sight_where_the_body_does_not_hide_it(mug):
+    view = mug_view(TRAINED, np.random.default_rng(0))
+    aside, behind, before = (mug.handle_in_sight(view, np.radians(degrees)) for degrees in (0, 90, 270))
+    assert behind == 0.0 and before == 1.0 and 0.9 < aside <= 1.0
+    partly = [mug.handle_in_sight(view, np.radians(degrees)) for degrees in range(0, 91, 5)]
+    assert (np.diff(partly) <= 0.05).all() and any(0.2 < share < 0.8 for share in partly)
+
+
+def test_a_circular_standard_deviation_is_that_of_a_narrow_density_and_large_of_a_flat_one():
+    axis = yaw_axis(3600)
+    narrow = np.exp(-0.5 * ((axis - 1.0) / 0.05) ** 2)
+    assert circular_sd(axis, narrow / narrow.sum()) == pytest.approx(np.degrees(0.05), rel=1e-3)
+    assert circular_sd(axis, np.full(3600, 1 / 3600)) > 360
+    two = np.isin(np.arange(3600), (0, 900)) / 2  # a quarter turn apart: a mean resultant of cos(45 degrees)
+    assert circular_sd(axis, two) == pytest.approx(np.degrees(np.sqrt(np.log(2))))
 
 
 def test_cross_entropy_is_least_of_the_posterior_itself():
@@ -115,7 +132,7 @@ def test_yaws_of_samples_are_those_in_the_tables_frame():
 def parser_rows(mug, clean):
     """Rows of a stand-in for a parser that gives samples about the true yaw, or fails."""
     images = mug_images(mug, TRAINED, 1, (5,))
-    truth = Truth(images, np.array([yaw_posterior(images.depth[0], clean, TRAINED.noise)]))
+    truth = Truth(images, np.array([yaw_posterior(images.depth[0], clean, TRAINED.noise)]), np.ones(1))
     turn = 0.5  # of the true mesh in the frame of the model
 
     def made(fails: bool):
@@ -147,6 +164,7 @@ def made_up(method, training, loss, test="as trained"):
     row = {"method": method, "training": training, "test": test, "seconds": 1.0, "memory_bytes": 4000}
     row |= {"cross_entropy": [loss, loss + 1], "log_p_true": [-loss, -loss], "file_bytes": 1000 * (training + 1)}
     row |= {"entropy": [-3.0, 0.1], "best_von_mises": [-2.9, 0.2]}
+    row |= {"sd": [1.0, 40.0], "exact_sd": [0.8, 30.0], "handle": [1.0, 0.0]}
     if method == PARSER:
         row |= {"samples_cross_entropy": [0.0, 1.0], "samples_log_p_true": [0.0, 1.0]}
     return row
@@ -163,11 +181,23 @@ def test_summary_lines_and_picture(tmp_path):
     rows[1] = made_up("network 1 M", 100, 2.0)
     assert mug_pose.summary(rows)["network_needs"] == {"as trained": None}
     paths = mug_pose.plot(rows, tmp_path)
-    assert [path.suffix for path in paths] == [".pdf", ".png"] and all(path.stat().st_size > 1000 for path in paths)
+    assert [path.suffix for path in paths] == [".pdf", ".png"] * 2 and all(path.stat().st_size > 1000 for path in paths)
     rows[0] |= {"looks": [[50, 1.0, 1.1], [100, 0.8, 0.9]], "steps": 100, "validation_loss": 0.9}
     names = [path.name for path in mug_pose.plot(rows, tmp_path)]
-    assert names[2:] == ["mug-pose-training.pdf", "mug-pose-training.png"]
+    assert names[4:] == ["mug-pose-training.pdf", "mug-pose-training.png"]
     assert "mesh" in mug_pose.line(rows[-1]) and mug_pose.plot([], tmp_path) == []
+
+
+def test_what_is_not_met_is_judged_with_five_views():
+    network = "network 1 M"
+    rows = [made_up(network, 100, 0.2), made_up(network, 3000, 0.1), made_up(PARSER, 5, 0.3), made_up(PARSER, 10, 0.0)]
+    rows += [made_up(network, size, loss, "moved") for size, loss in ((1000, 0.6), (3000, 0.3))]
+    rows += [made_up(PARSER, 5, 0.4, "moved")]
+    told = mug_pose.summary(rows)
+    assert told["not_met"] == [f"as trained: {network}, 100 images", f"moved: {network}, 3000 images"]
+    assert told["moved: Bayes3D 5"]["above_exact"] == pytest.approx(0.9 - -1.45)
+    rows[3]["file_bytes"] = 16_001
+    assert mug_pose.summary(rows)["not_met"][-1] == "a file of 16001 bytes"
 
 
 @pytest.mark.parametrize("quick", [True, False])

@@ -93,6 +93,7 @@ def test_summary_lines_and_picture(tmp_path):
     assert told["network_needs"] == {"as trained": 100, "poses off": None}
     assert told["as trained: Bayes3D"]["images"] == 120 and told["as trained: network 10"]["calibration_error"] is None
     assert told["as trained: Bayes3D"]["calibration_error"] == pytest.approx(0.2)
+    assert told["not_met"] == [f"{kind}: calibration error 0.200" for kind in ("as trained", "poses off")]
     rows.append(made_up(object_type.ENSEMBLE, 10, 0.85))
     assert object_type.summary(rows)["network_needs"]["as trained"] == 10
     paths = object_type.plot(rows, tmp_path)
@@ -101,6 +102,16 @@ def test_summary_lines_and_picture(tmp_path):
     names = [path.name for path in object_type.plot(rows, tmp_path)]
     assert names[2:] == ["object-type-training.pdf", "object-type-training.png"]
     assert "Bayes3D" in object_type.line(rows[2]) and object_type.plot([], tmp_path) == []
+
+
+def test_networks_of_a_thousand_images_may_be_as_good_as_trained_and_none_with_poses_off():
+    rows = [made_up(NETWORK, size, p) for size, p in ((300, 0.95), (1000, 0.85), (3000, 0.97))]
+    rows += [made_up(PARSER, 0, 0.85) for _ in range(2)]
+    rows += [{**row, "test": "poses off"} for row in rows]
+    missed = [name for name in object_type.summary(rows)["not_met"] if "calibration" not in name]
+    assert missed == [f"poses off: {NETWORK}, {size} images" for size in (300, 1000, 3000)]
+    rows[1] = made_up(NETWORK, 1000, 0.86)
+    assert f"as trained: {NETWORK}, 1000 images" in object_type.summary(rows)["not_met"]
 
 
 @pytest.mark.parametrize("quick", [True, False])

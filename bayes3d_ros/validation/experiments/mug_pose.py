@@ -6,7 +6,8 @@
 Loss: cross-entropy from the exact posterior (`exact_yaw.py`: enumeration with the true mesh, the camera, the mug's
 place and the stated noise). Images are those of `mug_images.py`; both methods are given the same pixels, and the parser
 the camera's pose. A von Mises is fitted to its 1,000 samples by maximum likelihood; beside that stands the loss of the
-samples themselves, through a narrow kernel.
+samples themselves, through a narrow kernel. `mug-pose-handle` shows how widely each spreads the yaw, by how much of the
+handle is in sight.
 
 Networks have three sizes. Of the middle one there is also, at 1,000 and 10,000 images, what a reviewer would ask for:
 one trained on images that are shifted, offset and made noisier at random (`augmented`), and the mean of five
@@ -18,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +34,7 @@ from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import LearnerSettings, ParserSettings
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.mug_pose_plot import plot
+from bayes3d_ros.validation.experiments.mug_pose_summary import ENOUGH_VIEWS, PARSER, WANTED, summary
 from bayes3d_ros.validation.networks import augmentation, von_mises
 from bayes3d_ros.validation.networks.depth_input import DepthScale
 from bayes3d_ros.validation.networks.installed import require_networks
@@ -48,13 +50,19 @@ from bayes3d_ros.validation.simulate.mug_images import (
     mug_view,
     upright_mug,
 )
-from bayes3d_ros.validation.statistics.yaw_samples import YawScores, kernel_density, weighted_yaws, yaw_scores
+from bayes3d_ros.validation.statistics.yaw_samples import (
+    YawScores,
+    circular_sd,
+    kernel_density,
+    weighted_yaws,
+    yaw_scores,
+)
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 TRAINING, QUICK_TRAINING = (10, 30, 100, 300, 1000, 3000, 10_000), (10, 100)
 ASKED, QUICK_ASKED = (1000, 10_000), (100,)  # training images of the networks that a reviewer would ask for
-VIEWS, QUICK_VIEWS = (1, 2, 3, 5, 8, 10), (5,)
+VIEWS, QUICK_VIEWS = (1, 2, 3, ENOUGH_VIEWS, 8, 10), (ENOUGH_VIEWS,)
 TRUE_MESH = 0  # views of the model that is made from the mesh itself
 GROUPS, QUICK_GROUPS = 10, 1  # of test images a condition: a group has one camera and place
 GROUP, QUICK_GROUP = 10, 1  # images of a group
@@ -75,15 +83,16 @@ SETTINGS = ParserSettings(
     fixed_objects=1, max_objects=1, unknown=False, particles=1000, score_width=MUG_CAMERA.width, sigma_max=0.01
 )
 LEARNED = LearnerSettings(voxel_size=0.005)
-PARSER = "Bayes3D"
 HEADER = f"{'method':<23} {'training':>8} {'test':<10} {'images':>6} {'cross-entropy':>13} {'log p(true)':>11} {'s':>7}"
 
 
 class Truth(NamedTuple):
-    """Test images of one camera and place, and the exact posterior of each over `yaw_axis()`."""
+    """Test images of one camera and place; of each the exact posterior over `yaw_axis()`, and the share of the handle
+    that the mug does not hide."""
 
     images: MugImages
     posterior: Float[np.ndarray, "N K"]
+    handle: Float[np.ndarray, "N"]
 
 
 class KnownMug(NamedTuple):
@@ -169,7 +178,8 @@ def group_truth(
     drawn = MUG_CONDITIONS[condition]
     images = mug_images(mug(), drawn, each, (TEST_SEED, list(MUG_CONDITIONS).index(condition), group))
     clean = fixed() if drawn.one_view else every_yaw(mug(), images.view, len(fixed()))
-    return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]))
+    handle = np.array([mug().handle_in_sight(images.view, yaw) for yaw in images.yaw])
+    return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]), handle)
 
 
 def _all_groups(truth: Callable[[str, int], Truth], groups: int, condition: str) -> list[Truth]:
@@ -214,8 +224,9 @@ def _von_mises_scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], tr
 
 
 def _row(method: str, size: int, condition: str, scores: Sequence[YawScores], groups: Sequence[Truth]) -> Row:
-    """A value an image in each list: of the von Mises, then the exact posterior's own entropy, and the cross-entropy of
-    the best von Mises that there is."""
+    """A value an image in each list: of the von Mises, with its standard deviation in degrees; then the exact
+    posterior's own entropy and standard deviation, the cross-entropy of the best von Mises that there is, and the share
+    of the handle in sight."""
     best = [s.cross_entropy for truth in groups for s in _von_mises_scores(_best_fits(truth), truth)]
     return {
         "method": method,
@@ -223,7 +234,10 @@ def _row(method: str, size: int, condition: str, scores: Sequence[YawScores], gr
         "test": condition,
         "cross_entropy": [round(s.cross_entropy, 4) for s in scores],
         "log_p_true": [round(s.log_p_true, 4) for s in scores],
+        "sd": [round(s.sd, 3) for s in scores],
         "entropy": [round(entropy(exact), 4) for truth in groups for exact in truth.posterior],
+        "exact_sd": [round(circular_sd(yaw_axis(len(p)), p), 3) for truth in groups for p in truth.posterior],
+        "handle": [round(float(share), 3) for truth in groups for share in truth.handle],
         "best_von_mises": [round(value, 4) for value in best],
     }
 
@@ -308,39 +322,3 @@ def line(row: Row) -> str:
         f"{row['method']:<23} {row['training'] or 'mesh':>8} {row['test']:<10} {len(row['cross_entropy']):>6} "
         f"{np.mean(row['cross_entropy']):>13.3f} {np.mean(row['log_p_true']):>11.3f} {row['seconds']:>7.1f}"
     )
-
-
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Per condition, method and size of its training (images, or views; `mesh`: none): `images`, means of
-    `cross_entropy` and `log_p_true` (nats), of the parser also those of its samples. Per condition the means of the
-    exact posterior's `entropy` and of the `best_von_mises`. Of each method the bytes to be kept. Then
-    `network_needs`: the fewest training images at which any network has no larger cross-entropy than the parser with
-    most views."""
-    told: dict[str, Any] = {}
-    losses: dict[tuple[str, str, int], float] = {}
-    for condition, method, size in dict.fromkeys((row["test"], row["method"], row["training"]) for row in rows):
-        own = [row for row in rows if (row["test"], row["method"], row["training"]) == (condition, method, size)]
-        losses[condition, method, size] = _mean_of(own, "cross_entropy")
-        keys = ("cross_entropy", "log_p_true", "samples_cross_entropy", "samples_log_p_true")
-        figures = {key: _mean_of(own, key) for key in keys if key in own[0]}
-        told[f"{condition}: {method} {size or 'mesh'}"] = {"images": sum(len(row["entropy"]) for row in own)} | figures
-    for condition in dict.fromkeys(row["test"] for row in rows):
-        own = [row for row in rows if row["test"] == condition]
-        told[f"{condition}: exact"] = {key: _mean_of(own[:1], key) for key in ("entropy", "best_von_mises")}
-    for method in dict.fromkeys(row["method"] for row in rows):
-        biggest = max((row for row in rows if row["method"] == method), key=lambda row: row["file_bytes"])
-        told[f"{method}: size"] = {key: biggest.get(key) for key in ("file_bytes", "memory_bytes", "parameters")}
-    return told | {"network_needs": {c: _needed(losses, c) for c in dict.fromkeys(row["test"] for row in rows)}}
-
-
-def _needed(losses: dict[tuple[str, str, int], float], condition: str) -> int | None:
-    ours = {size: loss for (c, method, size), loss in losses.items() if (c, method) == (condition, PARSER) and size}
-    if not ours:
-        return None
-    theirs = [(size, loss) for (c, method, size), loss in losses.items() if c == condition and method != PARSER]
-    return min((size for size, loss in theirs if loss <= ours[max(ours)]), default=None)
-
-
-def _mean_of(rows: Sequence[Row], key: str) -> float:
-    """Over the images of all rows."""
-    return round(float(np.mean([value for row in rows for value in row[key]])), 4)

@@ -14,17 +14,17 @@ from matplotlib.ticker import NullLocator
 
 from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.mug_pose_summary import ENOUGH_VIEWS, PARSER
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame, save_both
 from bayes3d_ros.validation.experiments.training_plot import plot_training
 
-PARSER = "Bayes3D"
 LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
 _KIB = 1024
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write mug-pose, as PDF and PNG: a column a condition, then memory; above cross-entropy, below log p(true yaw).
-    And mug-pose-training, see `plot_training`."""
+    Then mug-pose-handle, see `_plot_handle`, and mug-pose-training, see `plot_training`."""
     conditions = list(dict.fromkeys(row["test"] for row in rows))
     if not conditions:
         return []
@@ -42,7 +42,37 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         label_plot(axis, "KiB", "", title, size=8)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    return save_both(figure, folder / "mug-pose") + plot_training(rows, folder / "mug-pose-training")
+    paths = save_both(figure, folder / "mug-pose") + _plot_handle(rows, conditions, folder / "mug-pose-handle")
+    return paths + plot_training(rows, folder / "mug-pose-training")
+
+
+def _plot_handle(rows: Sequence[Row], conditions: Sequence[str], path: Path) -> list[Path]:
+    """Standard deviations of the yaw by the share of the handle in sight, a column a condition: of the exact posterior,
+    of the parser with ENOUGH_VIEWS, and of the network that has the least cross-entropy there."""
+    figure = Figure(figsize=(2.9 * len(conditions), 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(conditions), squeeze=False, sharex=True, sharey=True)[0]
+    for axis, condition in zip(axes, conditions, strict=True):
+        here = [row for row in rows if row["test"] == condition]
+        networks = [row for row in here if row["method"] != PARSER]
+        best = min(networks, key=lambda row: np.mean(row["cross_entropy"]), default=None)
+        ours = [row for row in here if row["method"] == PARSER and row["training"] == ENOUGH_VIEWS]
+        for own, key, style, label in (
+            (ours, "exact_sd", {"color": GREY, "marker": "_"}, "exact posterior"),
+            ([] if best is None else [best], "sd", {"color": colour(2), "marker": "."}, "best network"),
+            (ours, "sd", {"color": INK, "marker": "."}, f"Bayes3D, {ENOUGH_VIEWS} views"),
+        ):
+            shares, spreads = ([value for row in own for value in row[name]] for name in ("handle", key))
+            axis.plot(shares, spreads, linestyle="none", alpha=0.7, label=label, **style)  # type: ignore[arg-type]
+        axis.set_yscale("log")
+        axis.set_yticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
+        axis.yaxis.set_minor_locator(NullLocator())
+        axis.tick_params(labelsize=8)
+        open_frame(axis)
+        label_plot(axis, "share of the handle in sight", "", condition, size=8)
+    axes[0].set_ylabel("standard deviation of the yaw, degrees", fontsize=8, color=INK)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return save_both(figure, path)
 
 
 def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, str | None]) -> None:

@@ -48,7 +48,7 @@ from bayes3d_ros.validation.simulate.occluded_images import (
 from bayes3d_ros.validation.simulate.scene_file import find_mesh
 from bayes3d_ros.validation.statistics.reliability import LEAST_PROBABILITY, binary_scores
 
-__all__ = ["HEADER", "count", "line", "notes", "plot", "steps", "summary"]
+__all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
 TRAINING, QUICK_TRAINING = (10, 30, 100, 300, 1000, 3000, 10_000), (10, 100)
 ASKED, QUICK_ASKED = (1000, 10_000), (100,)  # training images of the networks that a reviewer would ask for
@@ -63,6 +63,12 @@ SETTINGS = ParserSettings(fixed_objects=2, max_objects=2, unknown=False, score_w
 VOXEL = 0.004  # metres
 AUGMENTATION = augmentation.usual(SCALE, shift=4)
 PARSER = "Bayes3D"
+AS_TRAINED, MANY_IMAGES = "as trained", 1000  # there the parser has to be as good as networks of so many images
+MOST_CALIBRATION_ERROR = 0.05
+WANTED = {
+    "not_met": "a log loss below that of all networks with poses off, and at most that of networks of "
+    f"{MANY_IMAGES:,} images as trained; a calibration error of at most {MOST_CALIBRATION_ERROR:g} in both"
+}
 WIDE, AUGMENTED, ENSEMBLE = "network (wider)", "network (augmented)", "network (ensemble)"
 HEADER = f"{'method':<19} {'training':>8} {'test':<10} {'images':>6} {'right':>6} {'log loss':>8} {'s':>7}"
 
@@ -219,7 +225,8 @@ def line(row: Row) -> str:
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Per method, number of training images and kind of test images: `images`, `accuracy`, `log_loss` (nats),
     `calibration_error`; sizes of what has to be kept, bytes. Then, per kind, the fewest training images at which a
-    network is as good as the parser in log loss (`network_needs`; null: it never is)."""
+    network is as good as the parser in log loss (`network_needs`; null: it never is). `not_met`: networks that are
+    better where they should not be, and calibration errors of the parser that are too large."""
     told: dict[str, Any] = {}
     for (method, size, kind), own in grouped(rows).items():
         name = f"{kind}: {method}" + (f" {size}" if size else "")
@@ -229,14 +236,38 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     for method in dict.fromkeys(row["method"] for row in rows):
         first = next(row for row in rows if row["method"] == method)
         told[f"{method}: size"] = {key: first.get(key) for key in ("file_bytes", "memory_bytes", "parameters")}
-    told["network_needs"] = {kind: _needed(rows, kind) for kind in dict.fromkeys(row["test"] for row in rows)}
-    return told
+    kinds = dict.fromkeys(row["test"] for row in rows)
+    told["network_needs"] = {kind: _needed(rows, kind) for kind in kinds}
+    return told | {"not_met": [missed for kind in kinds for missed in _missed(rows, kind)]}
+
+
+def _log_losses(rows: Sequence[Row], kind: str) -> dict[tuple[str, int], float]:
+    """By method and number of training images."""
+    return {
+        (method, size): binary_scores(*own).log_loss for (method, size, k), own in grouped(rows).items() if k == kind
+    }
+
+
+def _missed(rows: Sequence[Row], kind: str) -> list[str]:
+    """What WANTED asks for and test images of a kind do not show."""
+    losses = _log_losses(rows, kind)
+    ours = losses.pop((PARSER, 0), None)
+    if ours is None:
+        return []
+    inside = kind == AS_TRAINED
+    missed = [
+        f"{kind}: {method}, {size} images"
+        for (method, size), loss in losses.items()
+        if (size == MANY_IMAGES and loss < ours if inside else loss <= ours)
+    ]
+    error = binary_scores(*grouped(rows)[PARSER, 0, kind]).calibration_error
+    if error is not None and error > MOST_CALIBRATION_ERROR:
+        missed.append(f"{kind}: calibration error {error:.3f}")
+    return missed
 
 
 def _needed(rows: Sequence[Row], kind: str) -> int | None:
-    losses = {
-        (method, size): binary_scores(*own).log_loss for (method, size, k), own in grouped(rows).items() if k == kind
-    }
+    losses = _log_losses(rows, kind)
     ours = losses.get((PARSER, 0))
     good = [size for (method, size), loss in losses.items() if method != PARSER and ours is not None and loss <= ours]
     return min(good, default=None)

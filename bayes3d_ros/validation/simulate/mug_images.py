@@ -25,6 +25,7 @@ _RADIUS, _HEIGHT, _WALL = 0.0465, 0.081, 0.0035  # metres: 025_mug's
 _HANDLE = (0.03, 0.014, 0.05)  # metres: how far it reaches out, its breadth and its height
 _SECTIONS = 128  # of a turn: the body is round to 0.02 mm
 MUG_CAMERA = Intrinsics(120.0, 120.0, 31.5, 23.5, 64, 48)
+_SAME_DEPTH = 1e-4  # metres
 _MIDDLE = 0.04  # metres above the table that the camera looks at: half of the mug's height
 
 
@@ -60,9 +61,10 @@ class MugView(NamedTuple):
 
 
 class UprightMug(NamedTuple):
-    """The mesh: upright, its axis the z axis of its frame, its handle along x."""
+    """The mesh: upright, its axis the z axis of its frame, its handle along x; and the handle alone."""
 
     thing: RestingObject
+    handle: RestingObject
 
     def pose(self, view: MugView, yaw: float) -> Float[np.ndarray, "4 4"]:
         """T_table_object of the mug upright at the view's place, turned by yaw about its axis."""
@@ -75,25 +77,41 @@ class UprightMug(NamedTuple):
         """What the camera would see without errors, metres."""
         return clean_depth([PlacedObject(self.thing, self.pose(view, yaw))], view.T_table_camera, MUG_CAMERA)
 
+    def handle_in_sight(self, view: MugView, yaw: float) -> float:
+        """Of the pixels that would show the handle if it stood alone, the share that the mug's body leaves."""
+        alone, bare = (
+            clean_depth(things, view.T_table_camera, MUG_CAMERA)
+            for things in ([PlacedObject(self.handle, self.pose(view, yaw))], [])
+        )
+        shows = alone < bare
+        return float((self.clean(view, yaw)[shows] > alone[shows] - _SAME_DEPTH).mean())
+
 
 def upright_mug() -> UprightMug:
     """The mug, its base on z = 0."""
-    return UprightMug(resting_object(MUG_NAME, _mug_mesh()))
+    meshes = _body_meshes() + _handle_meshes(inside=_WALL / 2), _handle_meshes(inside=0.0)
+    whole, part = (cast(trimesh.Trimesh, trimesh.util.concatenate(own)) for own in meshes)
+    return UprightMug(resting_object(MUG_NAME, whole), resting_object("handle", part))
 
 
-def _mug_mesh() -> trimesh.Trimesh:
+def _body_meshes() -> list[trimesh.Trimesh]:
     wall = trimesh.creation.annulus(_RADIUS - _WALL, _RADIUS, _HEIGHT, sections=_SECTIONS)
     bottom = trimesh.creation.cylinder(_RADIUS, _WALL, sections=_SECTIONS)
     wall.apply_translation((0, 0, _HEIGHT / 2))
     bottom.apply_translation((0, 0, _WALL / 2))
+    return [wall, bottom]
+
+
+def _handle_meshes(inside: float) -> list[trimesh.Trimesh]:
+    """inside: metres by which it reaches into the wall."""
     out, breadth, height = _HANDLE
     bar = 0.3 * out
     grip = trimesh.creation.box((bar, breadth, height))
     grip.apply_translation((_RADIUS + out - bar / 2, 0, _HEIGHT / 2))
     ends = [trimesh.creation.box((out, breadth, bar)) for _ in range(2)]
     for end, side in zip(ends, (-1, 1), strict=True):
-        end.apply_translation((_RADIUS - _WALL / 2 + out / 2, 0, _HEIGHT / 2 + side * (height - bar) / 2))
-    return cast(trimesh.Trimesh, trimesh.util.concatenate([wall, bottom, grip, *ends]))
+        end.apply_translation((_RADIUS - inside + out / 2, 0, _HEIGHT / 2 + side * (height - bar) / 2))
+    return [grip, *ends]
 
 
 def mug_view(condition: MugCondition, rng: np.random.Generator) -> MugView:

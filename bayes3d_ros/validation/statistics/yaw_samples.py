@@ -19,15 +19,25 @@ LogDensity = Callable[[Float[np.ndarray, "K"]], Float[np.ndarray, "K"]]  # radia
 
 
 class YawScores(NamedTuple):
-    """Of a density q of the yaw of one image, nats."""
+    """Of a density q of the yaw of one image; nats."""
 
     cross_entropy: float  # from the exact posterior
     log_p_true: float  # log q(true yaw)
+    sd: float  # degrees, circular
 
 
 def yaw_scores(q: LogDensity, axis: Float[np.ndarray, "K"], exact: Float[np.ndarray, "K"], yaw: float) -> YawScores:
     """exact: probabilities of the yaws on the axis, radians."""
-    return YawScores(float(-(exact * q(axis)).sum()), float(q(np.array([yaw]))[0]))
+    log_q = q(axis)
+    spread = circular_sd(axis, np.exp(log_q - np.logaddexp.reduce(log_q)))
+    return YawScores(float(-(exact * log_q).sum()), float(q(np.array([yaw]))[0]), spread)
+
+
+def circular_sd(axis: Float[np.ndarray, "K"], p: Float[np.ndarray, "K"]) -> float:
+    """Degrees: (-2 log R)^1/2, R the length of the mean resultant (Mardia and Jupp, Directional Statistics, 2000, 2.3).
+    p: probabilities of the yaws on the axis, radians."""
+    length = min(abs(float(p @ np.cos(axis)) + 1j * float(p @ np.sin(axis))), 1.0)
+    return float(np.degrees(np.sqrt(-2 * np.log(max(length, 1e-12)))))
 
 
 def weighted_yaws(
