@@ -19,6 +19,7 @@ from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open
 from bayes3d_ros.validation.experiments.training_plot import plot_training
 
 LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
+SHARPEST = 0.25  # degrees: half a step of the exact posterior's yaws
 _KIB = 1024
 
 
@@ -48,7 +49,8 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 def _plot_handle(rows: Sequence[Row], conditions: Sequence[str], path: Path) -> list[Path]:
     """Standard deviations of the yaw by the share of the handle in sight, a column a condition: of the exact posterior,
-    of the parser with ENOUGH_VIEWS, and of the network that has the least cross-entropy there."""
+    of the parser with ENOUGH_VIEWS, and of the network that has the least cross-entropy there. Those below SHARPEST are
+    drawn there."""
     figure = Figure(figsize=(2.9 * len(conditions), 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(conditions), squeeze=False, sharex=True, sharey=True)[0]
@@ -63,9 +65,11 @@ def _plot_handle(rows: Sequence[Row], conditions: Sequence[str], path: Path) -> 
             (ours, "sd", {"color": INK, "marker": "."}, f"Bayes3D, {ENOUGH_VIEWS} views"),
         ):
             shares, spreads = ([value for row in own for value in row[name]] for name in ("handle", key))
+            spreads = np.maximum(spreads, SHARPEST).tolist()
             axis.plot(shares, spreads, linestyle="none", alpha=0.7, label=label, **style)  # type: ignore[arg-type]
         axis.set_yscale("log")
-        axis.set_yticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
+        axis.set(xlim=(-0.04, 1.04), ylim=(0.8 * SHARPEST, 300))
+        axis.set_yticks([0.3, 1, 3, 10, 30, 100], ["0.3", "1", "3", "10", "30", "100"])
         axis.yaxis.set_minor_locator(NullLocator())
         axis.tick_params(labelsize=8)
         open_frame(axis)
