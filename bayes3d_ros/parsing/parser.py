@@ -18,6 +18,7 @@ from bayes3d_ros.likelihood import noise_marginal
 from bayes3d_ros.likelihood.image_model import ImageModel, image_model, sample_noise, with_unknown
 from bayes3d_ros.likelihood.scored_image import ScoredImage, array_shape
 from bayes3d_ros.likelihood.shared_errors import SharedErrorImage
+from bayes3d_ros.objects.footprint import Footprints
 from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import Library, check_types, type_names
 from bayes3d_ros.objects.placement import Table
@@ -30,7 +31,7 @@ from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import fewest_moved
 from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, likeliest, moved_again, sampler_runs
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture, pooled
-from bayes3d_ros.parsing.unknown_things import UnknownThing, find_things
+from bayes3d_ros.parsing.unknown_things import KnownObjects, UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import PER_FRAME, ParserSettings
@@ -56,6 +57,7 @@ class SceneParser:
         self.library, self.settings = library, settings
         self.capacity = max(capacity or 0, settings.max_objects)
         self._arrays = _of_types(library_arrays(library), library, settings.types)
+        self._footprints = Footprints(library)
         self._grid = noise_marginal.noise_grid(settings.sigma_max)
         self._table_size = (settings.table_width, settings.table_depth)
         self._sample_noise = jax.jit(sample_noise)
@@ -215,6 +217,7 @@ class SceneParser:
             (settings.fixed_objects if fixed else settings.max_objects) - count,
             fixed,
             settings.seed,
+            KnownObjects(stage.objects, self._footprints) if count else None,
         )
         log_weight = stage.log_weight + found.log_weight
         total = np.logaddexp.reduce(log_weight)

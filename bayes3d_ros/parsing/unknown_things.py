@@ -6,11 +6,12 @@ The likelihood scores returns in front of a scene as those of something unknown 
 connected region of such returns is a thing, or outliers, with
 
     log odds = sum over its returns of (log of the unknown surface's density - log of outliers') - outline's nats
-               + log(count_ratio P(unknown)),
+               + log(count_ratio P(unknown)) + log P(what it stands on),
 
-where the last term is the prior of one more thing. A thing is described by a box: upright, about its visible part, on
-the table. How far the box extends behind is uniform between the visible depth and the larger of the visible sides. Its
-other ends lie anywhere between the outermost returns and the next ones, which are not the thing's.
+where the second line is the prior of one more thing, and of what it stands on: the table, or a known object
+(`stacking.py`). A thing is described by a box: upright, about its visible part, on the table. How far the box extends
+behind is uniform between the visible depth and the larger of the visible sides. Its other ends lie anywhere between the
+outermost returns and the next ones, which are not the thing's.
 
 Where the prior has a region, a thing whose middle lies outside is neither reported nor counted; its returns stay what
 they are to any scene: those of such a thing, or outliers.
@@ -31,14 +32,17 @@ from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, NO_RETURN
 from bayes3d_ros.likelihood.shared_errors import OUTLINE_NATS
 from bayes3d_ros.likelihood.slow_pixel_kinds import NOTHING, OBJECT, TABLE, stands_in_front
-from bayes3d_ros.objects.placement import in_region
+from bayes3d_ros.objects.footprint import Footprints
+from bayes3d_ros.objects.placement import Placement, in_region
 from bayes3d_ros.parsing.observe import Observation
 from bayes3d_ros.parsing.posterior_constants import LEAST_THING, THINGS_APART
+from bayes3d_ros.parsing.stacking import log_support
 from bayes3d_ros.parsing.support_plane import connected_pieces
 
 _EIGHT = np.ones((3, 3))  # pixels that touch at a corner belong together
 _BRIDGED = 2  # pixels without a return across which a thing continues
 _LEAST_SIDE = 0.005  # metres: the smallest side of a box
+_FLOOR_POINTS = 200  # returns of a thing, at most, of which it is asked what is below them
 UNCERTAIN = 8  # numbers in which boxes of one thing differ, see `drawn_box`
 
 
@@ -54,6 +58,14 @@ class UnknownThing(NamedTuple):
         np.ndarray, "3"
     ]  # side along which it may go on (0 x, 1 y), towards which end (-1, 1), how far at most
     pixel: float  # metres between neighbouring returns, across the view
+    floor: Float[np.ndarray, "P 2"]  # places on the table below some of the returns
+
+
+class KnownObjects(NamedTuple):
+    """Of N scenes."""
+
+    objects: Placement  # [N, M], type -1 in empty slots
+    footprints: Footprints
 
 
 class ThingsOfScenes(NamedTuple):
@@ -70,22 +82,23 @@ def find_things(
     room: int,
     exactly: bool,
     seed: int,
+    known: KnownObjects | None = None,
 ) -> ThingsOfScenes:
     """Sample the unknown things of each scene. scenes: depth as the camera shows it; log_prior: of one more thing;
-    room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds. A thing whose
-    middle lies outside the region is not counted."""
+    room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds; known: what
+    else the scenes hold. A thing whose middle lies outside the region is not counted."""
     rng = np.random.default_rng(seed)
     part = before_the_table(seen)
-    known: dict[bytes, tuple[UnknownThing, ...]] = {}
+    found: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
     for n, depth in enumerate(scenes):
         mask = in_front(depth, seen, part)
         key = np.packbits(mask).tobytes()
-        if key not in known:
-            known[key] = _things(mask, seen)
+        if key not in found:
+            found[key] = _things(mask, seen)
         here: list[UnknownThing] = []
-        for thing in sorted(known[key], key=lambda thing: -thing.log_gain):
-            odds, full = thing.log_gain + log_prior, len(here) >= room
+        for thing in sorted(found[key], key=lambda thing: -thing.log_gain):
+            odds, full = thing.log_gain + log_prior + _log_support(thing, n, known), len(here) >= room
             if not in_region(thing.centre[0], thing.centre[1], seen.table):
                 log_weight[n] += float(np.logaddexp(odds, 0.0)) - thing.log_gain
                 continue
@@ -99,6 +112,13 @@ def find_things(
             log_weight[n] = -np.inf
         held.append(tuple(here))
     return ThingsOfScenes(held, log_weight)
+
+
+def _log_support(thing: UnknownThing, n: int, known: KnownObjects | None) -> float:
+    """`log_support` of a thing in scene n."""
+    if known is None:
+        return 0.0
+    return log_support(thing.floor, Placement(*(part[n] for part in known.objects)), known.footprints)
 
 
 def in_front(
@@ -164,7 +184,8 @@ def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownTh
         own = regions == k
         size, centre, yaw, behind = _box(points[own], camera[:2])
         pixel = float(np.median(seen.depth[own])) / seen.camera.fx
-        found.append(UnknownThing(np.flatnonzero(own), log_gain, size, centre, yaw, behind, pixel))
+        floor = points[own][:: -(-int(own.sum()) // _FLOOR_POINTS), :2]
+        found.append(UnknownThing(np.flatnonzero(own), log_gain, size, centre, yaw, behind, pixel, floor))
     return tuple(found)
 
 

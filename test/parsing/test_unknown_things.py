@@ -71,6 +71,13 @@ def test_an_unknown_thing_has_an_upright_box_on_the_table(both):
     assert (ball.size_sigma >= 0).all() and ball.size_sigma.max() < 0.03
 
 
+def test_an_unknown_thing_on_a_known_one_is_told_beside_it(parser):
+    on_top = trimesh.creation.icosphere(3, 0.035), at(-0.12, 0.02, 0.05 + 0.035)
+    told = parser.parse(plain_frame(BRICK, on_top))
+    assert sorted(o.type for o in told.objects) == ["brick", UNKNOWN]
+    assert all(o.probability > 0.99 and o.type_probabilities[o.type] > 0.99 for o in told.objects)
+
+
 def test_its_box_is_no_more_certain_than_the_pixels(both):
     """0.6 m away a pixel is 3 mm wide; each end of the box lies somewhere in one."""
     (ball,) = (o for o in both.objects if o.is_unknown)
@@ -81,7 +88,14 @@ def test_its_box_is_no_more_certain_than_the_pixels(both):
 
 def test_boxes_of_one_thing_spread_over_the_pixels_about_it():
     thing = UnknownThing(
-        np.arange(3), 1.0, np.array([0.1, 0.06, 0.05]), np.array([0.2, -0.1]), 0.3, np.array([1.0, -1.0, 0.04]), 0.004
+        np.arange(3),
+        1.0,
+        np.array([0.1, 0.06, 0.05]),
+        np.array([0.2, -0.1]),
+        0.3,
+        np.array([1.0, -1.0, 0.04]),
+        0.004,
+        np.zeros((1, 2)),
     )
     size, centre, yaw = drawn_box(thing, np.zeros(UNCERTAIN))
     np.testing.assert_allclose([*size, *centre, yaw], [0.1, 0.06, 0.05, 0.2, -0.1, 0.3])
