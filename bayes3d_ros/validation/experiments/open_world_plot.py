@@ -52,10 +52,12 @@ def _limits(axis: Axes, rows: Sequence[Row]) -> None:
         value = told[limit.kind].get(limit.measure)
         if value is not None:
             axis.barh(k, value, color=MISSED if limit.missed(value) else GREY, height=0.6)
-            axis.annotate(f"{value:.3g}", (value, k), xytext=(3, -3), textcoords="offset points", fontsize=8)
         bound = limit.least if limit.least is not None else limit.most
         assert bound is not None
         axis.plot([bound, bound], [k - 0.4, k + 0.4], color=INK, linewidth=1.5)
+        if value is not None:  # right of the bar and of its limit
+            at = (max(value, bound), k)
+            axis.annotate(f"{value:.3g}", at, xytext=(4, -3), textcoords="offset points", fontsize=8)
     axis.set_yticks(range(len(LIMITS)), [f"{limit.kind}: {limit.measure}" for limit in LIMITS], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlim(left=0)
