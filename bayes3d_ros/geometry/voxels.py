@@ -14,11 +14,13 @@ from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface,
 
 MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
 SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
+LEAST_BACK = 0.2  # of a voxel's face: the area of a wall's second side in a voxel from which it has a plane
+_SAME_SHEET = -0.3  # cosine between normals of one sheet and of a voxel's plane, at least
 REACH = 0.15  # a voxel's plane serves its cube inflated by this fraction of a voxel on every side
 
 
 class VoxelSolid(NamedTuple):
-    """A solid and its surface; fields as in `model.objects.ObjectModel`."""
+    """A solid and its surface; fields as in `objects.model.ObjectModel`."""
 
     voxel_size: float
     origin: Float[np.ndarray, "3"]
@@ -26,6 +28,9 @@ class VoxelSolid(NamedTuple):
     surface_index: Int[np.ndarray, "S 3"]
     surface_normal: Float[np.ndarray, "S 3"]
     surface_offset: Float[np.ndarray, "S"]
+    back_index: Int[np.ndarray, "B 3"] = np.zeros((0, 3), int)
+    back_normal: Float[np.ndarray, "B 3"] = np.zeros((0, 3))
+    back_offset: Float[np.ndarray, "B"] = np.zeros(0)
 
     @property
     def centre_of_mass(self) -> Float[np.ndarray, "3"]:
@@ -58,10 +63,10 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     occupancy = fill_enclosed(touched)
     drop = _redundant(patches, voxel_size, touched.shape)
     occupancy[tuple(patches.voxel[drop].T)] = patches.offset[drop] > 0  # where the centre lies behind the surface
-    keep = ~drop
-    return VoxelSolid(
-        float(voxel_size), origin, occupancy, patches.voxel[keep], patches.normal[keep], patches.offset[keep]
-    )
+    kept = Patches(*(part[~drop] for part in patches))
+    back = _back_sheets(samples, kept, origin, voxel_size, occupancy.shape)
+    surface = kept.voxel, kept.normal, kept.offset
+    return VoxelSolid(float(voxel_size), origin, occupancy, *surface, back.voxel, back.normal, back.offset)
 
 
 def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
@@ -81,7 +86,7 @@ class Patches(NamedTuple):
 
 
 def fit_planes(
-    samples: SurfaceSamples, origin: Float[np.ndarray, "3"], voxel_size: float, shape: tuple[int, int, int]
+    samples: SurfaceSamples, origin: Float[np.ndarray, "3"], voxel_size: float, shape: tuple[int, ...]
 ) -> Patches:
     """A plane in every voxel that holds a sample, fitted to the samples in and closely around the voxel.
 
@@ -97,7 +102,7 @@ def fit_planes(
     row_of[tuple(index.T + 1)] = np.arange(count)
 
     reference = _reference_normals(samples.normals, row, count)
-    same = np.einsum("ij,ij->i", samples.normals, reference[row]) > -0.3
+    same = np.einsum("ij,ij->i", samples.normals, reference[row]) > _SAME_SHEET
     ones = same.astype(float)
     number = np.bincount(row, ones, count)
     centroid = np.stack([np.bincount(row, ones * position[:, i], count) for i in range(3)], 1) / number[:, None]
@@ -112,7 +117,7 @@ def fit_planes(
         target = target[sample]
         away = position[sample] - centroid[target]
         agree = np.einsum("ij,ij->i", samples.normals[sample], reference[target])
-        weight = np.exp(-(away**2).sum(1) / (2 * width**2)) * (agree > -0.3)
+        weight = np.exp(-(away**2).sum(1) / (2 * width**2)) * (agree > _SAME_SHEET)
         total += np.bincount(target, weight, count)
         for i in range(3):
             first[:, i] += np.bincount(target, weight * away[:, i], count)
@@ -128,6 +133,28 @@ def fit_planes(
     offset = np.clip(np.einsum("ij,ij->i", normal, local), -limit, limit)
     area = np.bincount(row, minlength=count) * samples.area
     return Patches(index, normal, offset * voxel_size, (centroid - index - 0.5) * voxel_size, area)
+
+
+def _back_sheets(
+    samples: SurfaceSamples,
+    front: Patches,
+    origin: Float[np.ndarray, "3"],
+    voxel_size: float,
+    shape: tuple[int, ...],
+) -> Patches:
+    """Of voxels that hold both sides of a thin wall, the side that `front` does not have."""
+    row_of = np.full(shape, -1)
+    row_of[tuple(front.voxel.T)] = np.arange(len(front.voxel))
+    cell = np.clip(np.floor((samples.points - origin) / voxel_size).astype(int), 0, np.array(shape) - 1)
+    row = row_of[tuple(cell.T)]
+    behind = (row >= 0) & (np.einsum("ij,ij->i", samples.normals, front.normal[row]) <= _SAME_SHEET)
+    if not behind.any():
+        return Patches(*(part[:0] for part in front))
+    others = samples._replace(points=samples.points[behind], normals=samples.normals[behind])
+    back = fit_planes(others, origin, voxel_size, shape)
+    facing = np.einsum("ij,ij->i", back.normal, front.normal[row_of[tuple(back.voxel.T)]])
+    found = (back.area > LEAST_BACK * voxel_size**2) & (facing <= _SAME_SHEET)
+    return Patches(*(part[found] for part in back))
 
 
 def _reference_normals(

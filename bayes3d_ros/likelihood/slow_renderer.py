@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.objects.library_arrays import BOX_LOOSE, INFLATION
 from bayes3d_ros.objects.model import ObjectModel
+from bayes3d_ros.objects.thin_walls import backs_met, octants
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
 _RAYS_AT_A_TIME = 256  # rays, which bounds memory
@@ -32,8 +33,11 @@ def render(
     surface[tuple(model.surface_index.T)] = True
     depth = np.full(len(rays), np.inf)
     from_eye = model.surface_index + 0.5 - eye
+    normal, offset = _planes_met(model)
+    octant = octants(directions)
     for ray, cube in _pairs(from_eye, directions):
-        np.minimum.at(depth, ray, _surface_hit(model, cube, from_eye[cube], directions[ray], way[ray], near))
+        plane = normal[octant[ray], cube], offset[octant[ray], cube]
+        np.minimum.at(depth, ray, _surface_hit(plane, from_eye[cube], directions[ray], way[ray], near))
     from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
     for ray, cube in _pairs(from_eye, directions):
         np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], way[ray], near))
@@ -104,19 +108,29 @@ def _interior_hit(
     return np.where((enter <= leave) & (enter > near), enter, np.inf)
 
 
+def _planes_met(model: ObjectModel) -> tuple[Float[np.ndarray, "8 S 3"], Float[np.ndarray, "8 S"]]:
+    """Normals, and offsets in voxels, of the planes that rays of each octant of directions meet."""
+    normal, offset = (np.repeat(a[None], 8, 0) for a in (model.surface_normal, model.surface_offset / model.voxel_size))
+    row_of = np.full(model.occupancy.shape, -1)
+    row_of[tuple(model.surface_index.T)] = np.arange(len(model.surface_index))
+    row = row_of[tuple(model.back_index.T)]
+    for octant, met in enumerate(backs_met(model)):
+        normal[octant, row[met]] = model.back_normal[met]
+        offset[octant, row[met]] = model.back_offset[met] / model.voxel_size
+    return normal, offset
+
+
 def _surface_hit(
-    model: ObjectModel,
-    voxel: Int[np.ndarray, "N"],
+    plane: tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]],
     from_eye: Float[np.ndarray, "N 3"],
     direction: Float[np.ndarray, "N 3"],
     way: Float[np.ndarray, "N 2"],
     near: float,
 ) -> Float[np.ndarray, "N"]:
-    normal = model.surface_normal[voxel]
+    normal, offset = plane
     enter, leave = _within(from_eye, direction, way)
     facing = (normal * direction).sum(-1)
     facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
-    offset = model.surface_offset[voxel] / model.voxel_size
     meet = (offset + (normal * from_eye).sum(-1)) / facing
     reach = np.abs(meet[:, None] * direction - from_eye).max(-1)
     met = (enter <= leave) & (reach <= 0.5 + INFLATION) & (meet > near)

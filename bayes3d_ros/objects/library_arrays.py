@@ -15,6 +15,7 @@ from bayes3d_ros.objects.empty_boxes import empty_boxes
 from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
 from bayes3d_ros.objects.self_symmetry import self_symmetry
+from bayes3d_ros.objects.thin_walls import backs_met
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
@@ -31,7 +32,8 @@ class LibraryArrays(NamedTuple):
 
     A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8, -127 the least) and offset (int8); an
     empty voxel holds -128 and the sides of the empty box ahead (`empty_boxes.py`); one inside the solid is all zeros.
-    Every grid is there eight times, once for each octant of directions.
+    Every grid is there eight times, once for each octant of directions: of a thin wall in one voxel each octant has the
+    side that its rays meet (`thin_walls.py`).
     """
 
     num_types: Int[Array, ""]
@@ -85,26 +87,38 @@ def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
     solid = _solid(model)
     boxes = empty_boxes(solid).astype(np.uint32)
     words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
-    normal, offset = _planes(model)
-    plane = sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
-    words[:, *model.surface_index.T] = plane
+    words[:, *model.surface_index.T] = _plane_words(*_planes(model.surface_normal, model.surface_offset, model))
+    back = _plane_words(*_planes(model.back_normal, model.back_offset, model))
+    for octant, met in enumerate(backs_met(model)):
+        words[octant, *model.back_index[met].T] = back[met]
     return words.view(np.int32)
 
 
-def _planes(model: ObjectModel) -> tuple[Int[np.ndarray, "S 3"], Int[np.ndarray, "S"]]:
-    """The surface's normals, 127 long, and offsets, 127 of which are OFFSET_RANGE voxels."""
-    normal = np.rint(model.surface_normal * 127).astype(np.int64)
-    offset = np.rint(model.surface_offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
-    return normal, offset
+def _planes(
+    normal: Float[np.ndarray, "S 3"], offset: Float[np.ndarray, "S"], model: ObjectModel
+) -> tuple[Int[np.ndarray, "S 3"], Int[np.ndarray, "S"]]:
+    """Normals, 127 long, and offsets, 127 of which are OFFSET_RANGE voxels."""
+    rounded = np.rint(offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
+    return np.rint(normal * 127).astype(np.int64), rounded
+
+
+def _plane_words(normal: Int[np.ndarray, "S 3"], offset: Int[np.ndarray, "S"]) -> Int[np.ndarray, "S"]:
+    return sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
 
 
 def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
     """A convex solid around all that rays can meet, in voxels: planes in their inflated cubes, and voxels inside."""
     inside = model.occupancy.copy()
     inside[tuple(model.surface_index.T)] = False
-    normal, offset = _planes(model)
-    planes = patch_corners(model.surface_index, normal / 127, offset / 127 * OFFSET_RANGE, 0.5 + INFLATION)
-    return hull(np.concatenate([planes, cube_corners(np.argwhere(inside))]))
+    planes = [
+        (model.surface_index, *_planes(model.surface_normal, model.surface_offset, model)),
+        (model.back_index, *_planes(model.back_normal, model.back_offset, model)),
+    ]
+    patches = [
+        patch_corners(index, normal / 127, offset / 127 * OFFSET_RANGE, 0.5 + INFLATION)
+        for index, normal, offset in planes
+    ]
+    return hull(np.concatenate([*patches, cube_corners(np.argwhere(inside))]))
 
 
 def library_arrays(library: Library) -> LibraryArrays:

@@ -29,10 +29,12 @@ class ObjectModel:
     Voxel (i, j, k) is the cube [origin + voxel_size * (i, j, k), + voxel_size]. `occupancy` is the solid with its
     cavities open (the inside of a mug is not occupied). Every surface voxel carries a plane fitted to the piece of
     surface inside it, normal . (x - centre_of_voxel) = offset, so that a coarse grid still renders a smooth and
-    accurate surface; normals point out of the solid where that is known. `box` is a stored box around the object;
-    its face k = 0..5 is its +x -x +y -y +z -z side. An object that touches the table with face k rests with
-    `contact_normal[k]` pointing straight down: the resting facet of the convex hull closest to that face,
-    `contact_height[k]` = max over the surface of contact_normal[k] . x away from the origin.
+    accurate surface; normals point out of the solid where that is known. A voxel of `back_index` holds both sides of a
+    thin wall: `back_normal` and `back_offset` are the plane of the side with less area (`thin_walls.py`).
+
+    `box` is a stored box around the object; its face k = 0..5 is its +x -x +y -y +z -z side. An object that touches the
+    table with face k rests with `contact_normal[k]` pointing straight down: the resting facet of the convex hull
+    closest to that face, `contact_height[k]` = max over the surface of contact_normal[k] . x away from the origin.
 
     Raises ValueError, naming the field, where a value cannot be right.
     """
@@ -50,6 +52,9 @@ class ObjectModel:
     contact_height: Float[np.ndarray, "6"]
     provenance: dict = field(default_factory=dict)  # where it came from; JSON values
     surface_views: Int[np.ndarray, "S"] | None = None  # how many views saw each surface voxel; None: not learned
+    back_index: Int[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3), int))  # some of surface_index
+    back_normal: Float[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    back_offset: Float[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0))  # metres
 
     def __post_init__(self) -> None:
         _check(self)
@@ -79,7 +84,7 @@ def _check(model: ObjectModel) -> None:
         raise ValueError(f"occupancy must be a 3D bool array with a voxel set, got shape {model.occupancy.shape}")
     if model.occupancy.size > MAX_VOXELS:
         raise ValueError(f"occupancy may have {MAX_VOXELS} voxels at most, got shape {model.occupancy.shape}")
-    count = len(model.surface_index)
+    count, backs = len(model.surface_index), len(model.back_index)
     if count == 0:
         raise ValueError("surface_index must name at least one voxel")
     shapes = {
@@ -91,6 +96,9 @@ def _check(model: ObjectModel) -> None:
         "box_size": (3,),
         "contact_normal": (6, 3),
         "contact_height": (6,),
+        "back_index": (backs, 3),
+        "back_normal": (backs, 3),
+        "back_offset": (backs,),
     }
     for name, shape in shapes.items():
         value = getattr(model, name)
@@ -98,15 +106,17 @@ def _check(model: ObjectModel) -> None:
             raise ValueError(f"{name} must have shape {shape}, got {value.shape}")
         if not np.isfinite(value).all():
             raise ValueError(f"{name} holds values that are not finite")
-        if np.abs(value).max() > _LARGEST:
+        if np.abs(value).max(initial=0) > _LARGEST:
             raise ValueError(f"{name} holds {np.abs(value).max():g}, expected {_LARGEST:g} at most")
     if (model.surface_index < 0).any() or (model.surface_index >= model.occupancy.shape).any():
         raise ValueError(f"surface_index points outside the grid of {model.occupancy.shape} voxels")
-    for name in ("surface_normal", "contact_normal"):
+    _check_backs(model)
+    for name in ("surface_normal", "back_normal", "contact_normal"):
         if not np.allclose(np.linalg.norm(getattr(model, name), axis=1), 1, atol=1e-3):
             raise ValueError(f"{name} must hold unit vectors")
-    if (np.abs(model.surface_offset) > np.sqrt(3) / 2 * model.voxel_size * 1.001).any():
-        raise ValueError("surface_offset lies outside its voxel")
+    for name in ("surface_offset", "back_offset"):
+        if (np.abs(getattr(model, name)) > np.sqrt(3) / 2 * model.voxel_size * 1.001).any():
+            raise ValueError(f"{name} lies outside its voxel")
     if model.surface_views is not None and model.surface_views.shape != model.surface_offset.shape:
         raise ValueError(f"surface_views must have one number a surface voxel, got shape {model.surface_views.shape}")
     rotation = model.T_object_box[:3, :3]
@@ -114,6 +124,14 @@ def _check(model: ObjectModel) -> None:
         raise ValueError("T_object_box must be a rigid transform")
     if not (model.box_size > 0).all():
         raise ValueError("box_size must be positive")
+
+
+def _check_backs(model: ObjectModel) -> None:
+    surface = np.zeros(model.occupancy.shape, bool)
+    surface[tuple(model.surface_index.T)] = True
+    inside = (model.back_index >= 0).all() and (model.back_index < model.occupancy.shape).all()
+    if not inside or not surface[tuple(model.back_index.T)].all():
+        raise ValueError("back_index names a voxel that is not one of surface_index")
 
 
 @dataclass(frozen=True, eq=False)

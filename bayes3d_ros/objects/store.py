@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.files.npz_file import read_arrays
@@ -53,9 +54,6 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
     surface[tuple(model.surface_index.T)] = True
     if surface.sum() != len(model.surface_index):
         raise ValueError("surface_index names a voxel twice")
-    normal = model.surface_normal[order]
-    # Scaled to the cube, not the ball: uses the whole range of every byte.
-    normal = normal / np.abs(normal).max(1, keepdims=True)
     meta = {
         "format": FORMAT_VERSION,
         "name": model.name,
@@ -67,13 +65,19 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
         "shape": np.array(shape, np.int32),
         "occupancy": np.packbits(model.occupancy),
         "surface": np.packbits(surface),
-        "surface_normal": np.rint(127 * normal).astype(np.int8).T,  # planar, it compresses better
-        "surface_offset": np.rint(model.surface_offset[order] / _offset_step(model.voxel_size)).astype(np.int8),
+        "surface_normal": _normal_bytes(model.surface_normal[order]),
+        "surface_offset": _offset_bytes(model.surface_offset[order], model.voxel_size),
         "frames": np.concatenate(
             [model.origin, model.T_object_box[:3].ravel(), model.box_size, model.contact_height]
         ).astype(np.float64),
         "contact_normal": model.contact_normal.astype(np.float64),
     }
+    if len(model.back_index):  # files of versions before have none, and those versions read past it
+        back = np.ravel_multi_index(tuple(model.back_index.T), shape)
+        own = np.argsort(back)
+        arrays["back"] = np.packbits(np.isin(np.flatnonzero(surface), back, assume_unique=True))
+        arrays["back_normal"] = _normal_bytes(model.back_normal[own])
+        arrays["back_offset"] = _offset_bytes(model.back_offset[own], model.voxel_size)
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
     path = model_path(folder, model.name)
@@ -83,6 +87,25 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
         refuse_existing(folder, model.name)
         raise
     return path
+
+
+def _normal_bytes(normal: Float[np.ndarray, "S 3"]) -> Int[np.ndarray, "3 S"]:
+    """Scaled to the cube, not the ball: uses the whole range of every byte. Planar, it compresses better."""
+    return np.rint(127 * normal / np.abs(normal).max(1, keepdims=True)).astype(np.int8).T
+
+
+def _offset_bytes(offset: Float[np.ndarray, "S"], voxel_size: float) -> Int[np.ndarray, "S"]:
+    return np.rint(offset / _offset_step(voxel_size)).astype(np.int8)
+
+
+def _planes(
+    arrays: dict[str, np.ndarray], kind: str, count: int, voxel_size: float
+) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
+    """Normals and offsets of as many planes."""
+    normal, offset = arrays[f"{kind}_normal"].T.astype(float), arrays[f"{kind}_offset"].astype(float)
+    if normal.shape != (count, 3) or offset.shape != (count,):
+        raise ValueError(f"{kind}_normal and {kind}_offset must describe {count} voxels")
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12), offset * _offset_step(voxel_size)
 
 
 def _offset_step(voxel_size: float) -> float:
@@ -117,6 +140,9 @@ _TYPES: dict[str, Any] = {
     "frames": np.float64,
     "contact_normal": np.float64,
     "surface_views": np.uint8,
+    "back": np.uint8,
+    "back_normal": np.int8,
+    "back_offset": np.int8,
 }
 
 
@@ -139,10 +165,15 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
             raise ValueError(f"{name} must hold {(cells + 7) // 8} bytes for a grid of {shape}, got {packed.shape}")
         masks[name] = np.unpackbits(packed, count=cells).astype(bool).reshape(shape)
     index = np.argwhere(masks["surface"])
-    normal, offset = arrays["surface_normal"].T.astype(float), arrays["surface_offset"].astype(float)
+    normal, offset = _planes(arrays, "surface", len(index), voxel_size)
     frames = arrays["frames"]
-    if normal.shape != (len(index), 3) or offset.shape != (len(index),):
-        raise ValueError(f"surface_normal and surface_offset must describe {len(index)} surface voxels")
+    backs = {}
+    if "back" in arrays:
+        if arrays["back"].shape != ((len(index) + 7) // 8,):
+            raise ValueError(f"back must hold {(len(index) + 7) // 8} bytes for {len(index)} surface voxels")
+        backs["back_index"] = index[np.unpackbits(arrays["back"], count=len(index)).astype(bool)]
+        planes = _planes(arrays, "back", len(backs["back_index"]), voxel_size)
+        backs["back_normal"], backs["back_offset"] = planes
     if frames.shape != (24,):
         raise ValueError(f"frames must hold 24 numbers, got {frames.shape}")
     return ObjectModel(
@@ -151,14 +182,15 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
         origin=frames[:3],
         occupancy=masks["occupancy"],
         surface_index=index,
-        surface_normal=normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12),
-        surface_offset=offset * _offset_step(voxel_size),
+        surface_normal=normal,
+        surface_offset=offset,
         T_object_box=np.vstack([frames[3:15].reshape(3, 4), [0, 0, 0, 1]]),
         box_size=frames[15:18],
         contact_normal=arrays["contact_normal"],
         contact_height=frames[18:],
         provenance=meta["provenance"],
         surface_views=arrays["surface_views"].astype(int) if "surface_views" in arrays else None,
+        **backs,
     )
 
 

@@ -216,3 +216,20 @@ def test_rendered_planes_are_close_to_the_mesh(name):
     assert np.abs(np.median(errors)) < 1e-4
     assert np.quantile(np.abs(errors), 0.95) < 1.5e-3
     assert missed < 0.015  # the outermost fraction of a millimetre of edges, which planes cut off
+
+
+def test_a_voxel_that_holds_both_sides_of_a_wall_has_a_plane_of_each():
+    """A plate of half a voxel, turned: its sides are 0.75 mm from its middle."""
+    plate = trimesh.creation.box((0.09, 0.06, VOXEL / 2), transform=TURN)
+    solid = voxelize(plate, VOXEL)
+    row_of = {tuple(voxel): row for row, voxel in enumerate(solid.surface_index.tolist())}
+    rows = [row_of[tuple(voxel)] for voxel in solid.back_index.tolist()]
+    assert len(rows) == len(set(rows)) > 0.3 * len(solid.surface_index)
+    centres = solid.origin + (solid.back_index + 0.5) * VOXEL
+    local = (centres + solid.back_normal * solid.back_offset[:, None]) @ TURN[:3, :3]
+    front = (centres + solid.surface_normal[rows] * solid.surface_offset[rows][:, None]) @ TURN[:3, :3]
+    inner = (np.abs(local[:, :2]) < [0.04, 0.025]).all(1)
+    np.testing.assert_allclose(np.abs(local[inner, 2]), VOXEL / 4, atol=1e-5)
+    np.testing.assert_allclose(local[inner, 2], -front[inner, 2], atol=1e-5)
+    for name in ("sphere", "box"):
+        assert len(voxelize(SHAPES[name], VOXEL).back_index) == 0

@@ -8,12 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from bayes3d_ros.likelihood import slow_renderer
 from bayes3d_ros.likelihood.march import march
 from bayes3d_ros.likelihood.slow_renderer import render
-from bayes3d_ros.objects.library_arrays import OFFSET_RANGE
+from bayes3d_ros.objects.library_arrays import OFFSET_RANGE, library_arrays
+from bayes3d_ros.objects.mesh_import import model_from_mesh
+from bayes3d_ros.objects.model import Library
 
 SIDE = 40
 
@@ -52,8 +55,9 @@ def centred(model, pose):
 def as_packed(model):
     """The model with its planes rounded to 8 bits, as `library_arrays` packs them."""
     packed, unit = copy.copy(model), OFFSET_RANGE * model.voxel_size / 127
-    object.__setattr__(packed, "surface_normal", np.rint(model.surface_normal * 127) / 127)
-    object.__setattr__(packed, "surface_offset", np.rint(model.surface_offset / unit) * unit)
+    for side in ("surface", "back"):
+        object.__setattr__(packed, f"{side}_normal", np.rint(getattr(model, f"{side}_normal") * 127) / 127)
+        object.__setattr__(packed, f"{side}_offset", np.rint(getattr(model, f"{side}_offset") / unit) * unit)
     return packed
 
 
@@ -140,6 +144,21 @@ def test_planes(cast, library, face):
         assert inside.sum() > 100
         error = np.abs(depth[inside] - expected[inside]) / model.voxel_size
         assert error.max() < 0.02 and np.quantile(error, 0.9) < 0.01
+
+
+def test_a_wall_thinner_than_a_voxel_is_met_on_the_side_that_rays_come_from():
+    """Without a plane for each side, one of them would be seen 1.5 mm off."""
+    thickness, away = 0.0015, 0.5
+    model = model_from_mesh(trimesh.creation.box((0.08, 0.08, thickness)), "plate", 0.004)
+    arrays = library_arrays(Library((model,)))
+    x, y = (jnp.asarray(a, jnp.float32) for a in pixel_rays(24, 200.0))
+    for turn in (np.diag([1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0])):
+        pose = np.eye(4)
+        pose[:3, :3], pose[2, 3] = turn, away
+        depth = np.asarray(march(arrays, jnp.int32(0), jnp.asarray(pose, jnp.float32), (x, y)))
+        inner = (np.abs(x * away) < 0.03) & (np.abs(y * away) < 0.03)
+        assert inner.sum() > 300
+        np.testing.assert_allclose(depth[inner], away - thickness / 2, atol=2e-5)
 
 
 def test_outlines_of_a_box(cast, library):

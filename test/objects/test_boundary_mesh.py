@@ -17,7 +17,8 @@ def solid(library: Library, occupancy: np.ndarray) -> ObjectModel:
     inside = np.argwhere(occupancy)[:1]
     return replace(
         model, occupancy=occupancy, surface_index=inside, surface_normal=np.array([[0.0, 0, 1]]), surface_views=None,
-        surface_offset=np.zeros(1),
+        surface_offset=np.zeros(1), back_index=np.zeros((0, 3), int), back_normal=np.zeros((0, 3)),
+        back_offset=np.zeros(0),
     )  # fmt: skip
 
 

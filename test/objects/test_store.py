@@ -40,14 +40,24 @@ def test_round_trip(model, tmp_path):
     read = load_model(path)
     for name in ("name", "voxel_size", "provenance"):
         assert getattr(read, name) == getattr(model, name)
-    for name in ("occupancy", "surface_index"):
+    for name in ("occupancy", "surface_index", "back_index"):
         np.testing.assert_array_equal(getattr(read, name), getattr(model, name))
     for name in ("origin", "T_object_box", "box_size", "contact_normal", "contact_height"):
         np.testing.assert_allclose(getattr(read, name), getattr(model, name), atol=1e-12)
-    cosine = np.einsum("ij,ij->i", read.surface_normal, model.surface_normal)
-    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.4
-    np.testing.assert_allclose(np.linalg.norm(read.surface_normal, axis=1), 1)
-    assert np.abs(read.surface_offset - model.surface_offset).max() <= 0.5001 * np.sqrt(3) / 2 * 0.005 / 127
+    assert len(model.back_index) > 100  # of the thin wall
+    for side in ("surface", "back"):
+        normal, written = getattr(read, f"{side}_normal"), getattr(model, f"{side}_normal")
+        assert np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normal, written), -1, 1))).max() < 0.4
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1)
+        off = getattr(read, f"{side}_offset") - getattr(model, f"{side}_offset")
+        assert np.abs(off).max() <= 0.5001 * np.sqrt(3) / 2 * 0.005 / 127
+
+
+def test_files_without_planes_of_second_sides_are_read(model, tmp_path):
+    path = save_model(model, tmp_path)
+    rewrite(path, back=None, back_normal=None, back_offset=None)
+    read = load_model(path)
+    assert len(read.back_index) == 0 and len(read.surface_index) == len(model.surface_index)
 
 
 def test_files_do_not_change_when_read_and_written_again(model, tmp_path):
@@ -59,7 +69,12 @@ def test_files_do_not_change_when_read_and_written_again(model, tmp_path):
 def test_the_order_of_surface_voxels_does_not_matter(model, tmp_path):
     order = np.random.default_rng(0).permutation(len(model.surface_index))
     fields = ("surface_index", "surface_normal", "surface_offset")
-    shuffled = dataclasses.replace(model, **{name: getattr(model, name)[order] for name in fields})
+    backs = np.random.default_rng(1).permutation(len(model.back_index))
+    shuffled = dataclasses.replace(
+        model,
+        **{name: getattr(model, name)[order] for name in fields},
+        **{name: getattr(model, name)[backs] for name in ("back_index", "back_normal", "back_offset")},
+    )
     assert save_model(model, tmp_path / "a").read_bytes() == save_model(shuffled, tmp_path / "b").read_bytes()
 
 
@@ -200,6 +215,9 @@ def test_a_plain_array_is_refused(tmp_path):
         ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "meta"),
         ({"surface_normal": np.zeros((3, 4), np.int8)}, "must describe"),
         ({"surface_offset": np.zeros(4, np.int8)}, "must describe"),
+        ({"back": np.zeros(2, np.uint8)}, "back must hold"),
+        ({"back_offset": np.zeros(4, np.int8)}, "back_normal and back_offset must describe"),
+        ({"back_normal": None}, "the field 'back_normal' is missing"),
         ({"contact_normal": np.zeros((5, 3))}, "contact_normal must have shape"),
         ({"contact_normal": np.zeros((6, 3))}, "contact_normal must hold unit vectors"),
         ({"frames": np.full(24, np.nan)}, "not finite"),
@@ -246,6 +264,8 @@ def test_wrong_meta_is_named(model, tmp_path, changes, reason):
         ({"box_size": np.array([0.1, 0.0, 0.1])}, "box_size"),
         ({"T_object_box": np.diag([1.0, 1, -1, 1])}, "rigid"),
         ({"origin": np.zeros(4)}, "origin must have shape"),
+        ({"back_index": np.full((1, 3), -1)}, "back_normal must have shape"),
+        ({"back_index": np.full((1, 3), 99), "back_normal": np.eye(3)[:1], "back_offset": np.zeros(1)}, "back_index"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
