@@ -94,7 +94,7 @@ def fit_planes(
     Where two sheets of a thin wall share a voxel, the plane is that of the sheet with more area in it.
     """
     position = (samples.points - origin) / voxel_size
-    cell = np.clip(np.floor(position).astype(int), 0, np.array(shape) - 1)
+    cell = _cells(position, shape)
     keys, row = np.unique(np.ravel_multi_index(tuple(cell.T), shape), return_inverse=True)
     index = np.stack(np.unravel_index(keys, shape), 1)
     count = len(keys)
@@ -135,6 +135,11 @@ def fit_planes(
     return Patches(index, normal, offset * voxel_size, (centroid - index - 0.5) * voxel_size, area)
 
 
+def _cells(position: Float[np.ndarray, "N 3"], shape: tuple[int, ...]) -> Int[np.ndarray, "N 3"]:
+    """The voxels that hold these points, in voxels from the grid's origin."""
+    return np.clip(np.floor(position).astype(int), 0, np.array(shape) - 1)
+
+
 def _back_sheets(
     samples: SurfaceSamples,
     front: Patches,
@@ -145,8 +150,7 @@ def _back_sheets(
     """Of voxels that hold both sides of a thin wall, the side that `front` does not have."""
     row_of = np.full(shape, -1)
     row_of[tuple(front.voxel.T)] = np.arange(len(front.voxel))
-    cell = np.clip(np.floor((samples.points - origin) / voxel_size).astype(int), 0, np.array(shape) - 1)
-    row = row_of[tuple(cell.T)]
+    row = row_of[tuple(_cells((samples.points - origin) / voxel_size, shape).T)]
     behind = (row >= 0) & (np.einsum("ij,ij->i", samples.normals, front.normal[row]) <= _SAME_SHEET)
     if not behind.any():
         return Patches(*(part[:0] for part in front))

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.objects.library_arrays import BOX_LOOSE, INFLATION
 from bayes3d_ros.objects.model import ObjectModel
-from bayes3d_ros.objects.thin_walls import backs_met, octants
+from bayes3d_ros.objects.thin_walls import octants, planes_met
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
 _RAYS_AT_A_TIME = 256  # rays, which bounds memory
@@ -33,10 +33,9 @@ def render(
     surface[tuple(model.surface_index.T)] = True
     depth = np.full(len(rays), np.inf)
     from_eye = model.surface_index + 0.5 - eye
-    normal, offset = _planes_met(model)
-    octant = octants(directions)
+    (normal, offset), octant = planes_met(model), octants(directions)
     for ray, cube in _pairs(from_eye, directions):
-        plane = normal[octant[ray], cube], offset[octant[ray], cube]
+        plane = normal[octant[ray], cube], offset[octant[ray], cube] / model.voxel_size
         np.minimum.at(depth, ray, _surface_hit(plane, from_eye[cube], directions[ray], way[ray], near))
     from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
     for ray, cube in _pairs(from_eye, directions):
@@ -106,18 +105,6 @@ def _interior_hit(
 ) -> Float[np.ndarray, "N"]:
     enter, leave = _within(from_eye, direction, way)
     return np.where((enter <= leave) & (enter > near), enter, np.inf)
-
-
-def _planes_met(model: ObjectModel) -> tuple[Float[np.ndarray, "8 S 3"], Float[np.ndarray, "8 S"]]:
-    """Normals, and offsets in voxels, of the planes that rays of each octant of directions meet."""
-    normal, offset = (np.repeat(a[None], 8, 0) for a in (model.surface_normal, model.surface_offset / model.voxel_size))
-    row_of = np.full(model.occupancy.shape, -1)
-    row_of[tuple(model.surface_index.T)] = np.arange(len(model.surface_index))
-    row = row_of[tuple(model.back_index.T)]
-    for octant, met in enumerate(backs_met(model)):
-        normal[octant, row[met]] = model.back_normal[met]
-        offset[octant, row[met]] = model.back_offset[met] / model.voxel_size
-    return normal, offset
 
 
 def _surface_hit(

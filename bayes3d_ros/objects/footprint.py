@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bayes3d_ros.objects.library_arrays import contact_transform
+from bayes3d_ros.objects.library_arrays import contact_transform, filled_voxels
 from bayes3d_ros.objects.model import Library, ObjectModel
 
 # Sides of a voxel: a square of that side holds the centre of a voxel however the grid is turned (sqrt(2) would do).
@@ -32,9 +32,7 @@ class Footprint(NamedTuple):
 def footprint(model: ObjectModel, face: int) -> Footprint:
     """Of a model that rests on this face. What is open counts as covered where a part of the object is over or under
     it: the inside of a mug, the space below a handle."""
-    filled = model.occupancy.copy()
-    filled[tuple(model.surface_index.T)] = True
-    centres = model.origin + (np.argwhere(filled) + 0.5) * model.voxel_size
+    centres = model.origin + (np.argwhere(filled_voxels(model)) + 0.5) * model.voxel_size
     T = contact_transform(model, face)
     flat = (centres @ T[:3, :3].T + T[:3, 3])[:, :2]
     cell = _CELL * model.voxel_size

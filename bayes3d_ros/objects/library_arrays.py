@@ -15,7 +15,7 @@ from bayes3d_ros.objects.empty_boxes import empty_boxes
 from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
 from bayes3d_ros.objects.self_symmetry import self_symmetry
-from bayes3d_ros.objects.thin_walls import backs_met
+from bayes3d_ros.objects.thin_walls import planes_met
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
@@ -84,26 +84,21 @@ def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
 
 def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
     """The model's grid as 32-bit words (see LibraryArrays)."""
-    solid = _solid(model)
+    solid = filled_voxels(model)
     boxes = empty_boxes(solid).astype(np.uint32)
     words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
-    words[:, *model.surface_index.T] = _plane_words(*_planes(model.surface_normal, model.surface_offset, model))
-    back = _plane_words(*_planes(model.back_normal, model.back_offset, model))
-    for octant, met in enumerate(backs_met(model)):
-        words[octant, *model.back_index[met].T] = back[met]
+    normal, offset = _planes(*planes_met(model), model)
+    parts = zip((*np.moveaxis(normal, -1, 0), offset), (24, 16, 8, 0), strict=True)
+    words[:, *model.surface_index.T] = sum((part & 255) << shift for part, shift in parts)
     return words.view(np.int32)
 
 
 def _planes(
-    normal: Float[np.ndarray, "S 3"], offset: Float[np.ndarray, "S"], model: ObjectModel
-) -> tuple[Int[np.ndarray, "S 3"], Int[np.ndarray, "S"]]:
+    normal: Float[np.ndarray, "*S 3"], offset: Float[np.ndarray, "*S"], model: ObjectModel
+) -> tuple[Int[np.ndarray, "*S 3"], Int[np.ndarray, "*S"]]:
     """Normals, 127 long, and offsets, 127 of which are OFFSET_RANGE voxels."""
     rounded = np.rint(offset / (OFFSET_RANGE * model.voxel_size) * 127).astype(np.int64).clip(-127, 127)
     return np.rint(normal * 127).astype(np.int64), rounded
-
-
-def _plane_words(normal: Int[np.ndarray, "S 3"], offset: Int[np.ndarray, "S"]) -> Int[np.ndarray, "S"]:
-    return sum((part & 255) << shift for part, shift in zip((*normal.T, offset), (24, 16, 8, 0), strict=True))
 
 
 def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
@@ -184,7 +179,7 @@ def _box_slab(model: ObjectModel) -> Float[np.ndarray, "5 3"]:
     return np.concatenate([axes * model.voxel_size, [low - first, high - first]])
 
 
-def _solid(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:
+def filled_voxels(model: ObjectModel) -> Bool[np.ndarray, "X Y Z"]:
     """The voxels that are of the solid or hold some of its surface."""
     solid = model.occupancy.copy()
     solid[tuple(model.surface_index.T)] = True

@@ -3,7 +3,7 @@
 """Which side of a thin wall rays meet, where both sides lie in one voxel (`ObjectModel.back_index`)."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bayes3d_ros.objects.model import ObjectModel
 
@@ -18,10 +18,15 @@ def octants(directions: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
     return ((directions < 0) * np.array([4, 2, 1])).sum(-1)
 
 
-def backs_met(model: ObjectModel) -> Bool[np.ndarray, "8 B"]:
-    """Whether rays of each octant meet the planes of `back_index`: where the voxel's other plane faces away."""
+def planes_met(model: ObjectModel) -> tuple[Float[np.ndarray, "8 S 3"], Float[np.ndarray, "8 S"]]:
+    """Normals, and offsets in metres, of the planes of all surface voxels, as rays of each octant meet them: those of
+    `back_index` where the voxel's other plane faces away."""
     row_of = np.full(model.occupancy.shape, -1)
     row_of[tuple(model.surface_index.T)] = np.arange(len(model.surface_index))
-    front = model.surface_normal[row_of[tuple(model.back_index.T)]]
+    row = row_of[tuple(model.back_index.T)]
     middle = _SIGNS / np.sqrt(3)
-    return (middle @ front.T > _AWAY) & (middle @ model.back_normal.T < _FACING)
+    met = (middle @ model.surface_normal[row].T > _AWAY) & (middle @ model.back_normal.T < _FACING)
+    normal, offset = (np.repeat(front[None], len(middle), 0) for front in (model.surface_normal, model.surface_offset))
+    octant, back = np.nonzero(met)
+    normal[octant, row[back]], offset[octant, row[back]] = model.back_normal[back], model.back_offset[back]
+    return normal, offset

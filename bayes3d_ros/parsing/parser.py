@@ -217,7 +217,7 @@ class SceneParser:
             (settings.fixed_objects if fixed else settings.max_objects) - count,
             fixed,
             settings.seed,
-            KnownObjects(stage.objects, self._footprints) if count else None,
+            KnownObjects(stage.objects, self._footprints),
         )
         log_weight = stage.log_weight + found.log_weight
         total = np.logaddexp.reduce(log_weight)
