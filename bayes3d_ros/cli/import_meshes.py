@@ -16,7 +16,7 @@ from bayes3d_ros.cli.progress import progress
 @click.option(
     "--voxel-size",
     type=click.FloatRange(0, min_open=True),
-    default=0.003,
+    default=0.002,
     show_default=True,
     help="Edge length of a voxel in metres. Smaller keeps finer detail.",
 )

@@ -24,7 +24,7 @@ from bayes3d_ros.lists import hint
 from bayes3d_ros.objects.model import NAME_PATTERN, LibraryError, ObjectModel, is_reserved
 from bayes3d_ros.objects.store import load_model, model_path, refuse_existing, save_model
 
-DEFAULT_VOXEL_SIZE = 0.003  # metres
+DEFAULT_VOXEL_SIZE = 0.002  # metres
 CONTACT_ANGLE = np.deg2rad(20.0)  # a resting facet stands for a box face up to this far from it
 CLOSENESS = np.deg2rad(8.0)  # of two such facets, the likelihood of the one this much farther off counts e times less
 

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from bayes3d_ros.cli import main
+from bayes3d_ros.objects.mesh_import import DEFAULT_VOXEL_SIZE
 from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings
 
 KINDS = {"parse": ParserSettings, "learn": LearnerSettings, "track": TrackerSettings}
@@ -34,3 +35,8 @@ def test_every_option_is_explained_in_whole_sentences(command: str) -> None:
     for parameter in found.params:
         if isinstance(parameter, click.Option):
             assert parameter.help and parameter.help.endswith("."), parameter.name
+
+
+def test_meshes_are_imported_with_the_same_voxels_by_the_command_and_by_the_function() -> None:
+    (option,) = (p for p in main.main.commands["import"].params if p.name == "voxel_size")
+    assert option.default == DEFAULT_VOXEL_SIZE
