@@ -63,8 +63,9 @@ paper: setup
 	for name in $(PAPER); do $(BIN)/bayes3d evaluate $$name $(QUICK) --out $(PAPER_OUT) || exit; done
 	$(BIN)/bayes3d report $(PAPER_OUT) --out docs/validation
 
+# A worker that crashes ends the run: pytest-xdist 3.8 can wait forever for a worker that replaces it (its issue 784).
 test: setup
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 $(PYTEST_ARGS)
 
 lint: setup
 	$(BIN)/ruff check .

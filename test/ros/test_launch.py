@@ -53,6 +53,7 @@ def start(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Star
         return launches[-1]
 
     yield start_launch
+    ros.leave()
     for launch in launches:
         for pid in pids(launch).values():
             if alive(pid):
