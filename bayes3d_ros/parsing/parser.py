@@ -149,8 +149,8 @@ class SceneParser:
     def _context(self, image: ScoredImage, errors: SharedErrorImage | None, table: Table) -> "_Models":
         on_device = jax.device_put(image)
         model = image_model(image, on_device, errors, self._grid, self.settings.window)
-        lead = None if errors is None or self.settings.unknown else with_unknown(image, errors)
-        return _Models(Context(on_device, self._arrays, table), model, lead)
+        guide = None if errors is None or self.settings.unknown else with_unknown(image, errors)
+        return _Models(Context(on_device, self._arrays, table), model, guide)
 
     def _sample(
         self, key: PRNGKeyArray, models: "_Models", seen: Observation | None = None
@@ -259,11 +259,11 @@ class SceneParser:
 
 
 class _Models(NamedTuple):
-    """What a frame is sampled under; lead: see `sampler_runs`."""
+    """What a frame is sampled under; guide: see `sampler_runs`."""
 
     context: Context
     model: ImageModel
-    lead: ImageModel | None
+    guide: ImageModel | None
 
 
 def _of_types(arrays: LibraryArrays, library: Library, types: tuple[str, ...]) -> LibraryArrays:

@@ -53,20 +53,20 @@ def sampler_runs(
     key: PRNGKeyArray,
     context: Context,
     model: ImageModel,
-    lead: ImageModel | None,
+    guide: ImageModel | None,
     settings: ParserSettings,
     slots: int,
     least_likely: float = LEAST_LIKELY_COUNT,
 ) -> list[SamplerRun]:
-    """One run; and another one where a model `lead` of the same image is given, whose targets it goes through. Of two
+    """One run; and another one where a model `guide` of the same image is given, whose targets it goes through. Of two
     runs those that have found the posterior's mass.
 
     slots: objects that a scene has room for. least_likely: nats; a run ends at a number of objects that is this much
     less likely than the best.
     """
     frame = _Frame(context, model, settings, slots, least_likely)
-    keys = [key] if lead is None else [key, jax.random.fold_in(key, _SECOND_RUN)]
-    runs = [_run(own, frame, target) for own, target in zip(keys, (None, lead), strict=False)]
+    keys = [key] if guide is None else [key, jax.random.fold_in(key, _SECOND_RUN)]
+    runs = [_run(own, frame, target) for own, target in zip(keys, (None, guide), strict=False)]
     best = likeliest(runs).best_log_mass
     kept = [(own, run) for own, run in zip(keys, runs, strict=True) if run.best_log_mass >= best - MISSED_NATS]
     return [_peaks_moved(own, run, frame) for own, run in kept]
@@ -106,15 +106,16 @@ def moved_again(
         return state
     key = jax.random.fold_in(key, 2000 + count)
     effort = Effort(jnp.int32(settings.rejuvenated_objects), jnp.int32(settings.tempering_steps))
-    return smc.refresh(key, state, jnp.int32(count), context, model, settings.window, settings.ess_threshold, effort)
+    window, threshold = settings.window, settings.ess_threshold
+    return smc.rejuvenated(key, state, jnp.int32(count), context, model, window, threshold, effort)
 
 
-def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRun:
+def _run(key: PRNGKeyArray, frame: _Frame, guide: ImageModel | None) -> SamplerRun:
     settings = frame.settings
     fixed = settings.fixed_objects >= 0
-    on_the_way = frame.model if lead is None else lead
+    on_the_way = frame.model if guide is None else guide
     ahead = empty_scenes(frame.context, on_the_way, settings, frame.slots)
-    states, log_mass = [_under_model(ahead, 0, frame, lead)], [0.0]
+    states, log_mass = [_under_model(ahead, 0, frame, guide)], [0.0]
     ess = []
     for count in range(settings.fixed_objects if fixed else settings.max_objects):
         ahead, info = smc.step(
@@ -127,7 +128,7 @@ def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRu
             settings.window,
             settings.ess_threshold,
         )
-        states.append(_under_model(ahead, count + 1, frame, lead))
+        states.append(_under_model(ahead, count + 1, frame, guide))
         ess.append(float(info.ess))
         log_mass.append(float(states[-1].log_evidence) + (count + 1) * np.log(settings.count_ratio))
         if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + frame.least_likely):
@@ -135,10 +136,10 @@ def _run(key: PRNGKeyArray, frame: _Frame, lead: ImageModel | None) -> SamplerRu
     return SamplerRun(states, log_mass, ess)
 
 
-def _under_model(ahead: smc.Population, count: int, frame: _Frame, lead: ImageModel | None) -> smc.Population:
-    if lead is None:
+def _under_model(ahead: smc.Population, count: int, frame: _Frame, guide: ImageModel | None) -> smc.Population:
+    if guide is None:
         return ahead
-    return retargeted(ahead, jnp.int32(count), frame.context, lead, frame.model, frame.settings.window)
+    return retargeted(ahead, jnp.int32(count), frame.context, guide, frame.model, frame.settings.window)
 
 
 def _peaks_moved(key: PRNGKeyArray, run: SamplerRun, frame: _Frame) -> SamplerRun:

@@ -4,7 +4,7 @@
 data; the best of those scored with the model itself, and followed uphill.
 
 It takes the place of the coarse-to-fine proposal of Bayes3D (Methodology, B): docs/departures.md says what differs, and
-why; docs/inference.md lists the levels.
+why; docs/inference.md, "Search", lists the steps.
 """
 
 from collections.abc import Callable

@@ -176,7 +176,7 @@ def _lead(state: Population, lead: Int[Array, ""], count: Int[Array, ""]) -> Lea
 
 
 @partial(jax.jit, static_argnames=("window", "ess_threshold"))
-def refresh(
+def rejuvenated(
     key: PRNGKeyArray,
     state: Population,
     count: Int[Array, ""],

@@ -132,7 +132,7 @@ ONE_BRICK = [(0, -0.05, 0.03, 0.4)]
 
 def counted():
     """How many times the sampler's parts were traced."""
-    return smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
+    return smc.step._cache_size(), smc.init._cache_size(), smc.rejuvenated._cache_size()
 
 
 APART = [(0, -0.13, 0.0, 0.4), (1, 0.14, 0.03, 0.2)]  # a brick on the left and a tower on the right

@@ -158,7 +158,7 @@ def test_with_room_for_one_the_larger_thing_is_told(parser):
 
 def test_what_stands_outside_the_region_is_not_told(parser):
     """Nor is it counted: the rest is as if it were not there, and nothing is compiled."""
-    traces = smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()
+    traces = smc.step._cache_size(), smc.init._cache_size(), smc.rejuvenated._cache_size()
     left = parser.changed(replace(SETTINGS, region=(-0.4, 0.0, -0.4, 0.4))).parse(plain_frame(BRICK, BALL))
     assert [o.type for o in left.objects] == ["brick"]
     assert left.num_objects[1] > 0.8 and left.num_unknown[0] > 0.99
@@ -166,7 +166,7 @@ def test_what_stands_outside_the_region_is_not_told(parser):
     right = parser.changed(replace(SETTINGS, region=(0.0, 0.4, -0.4, 0.4))).parse(plain_frame(BRICK, BALL))
     assert [o.type for o in right.objects] == [UNKNOWN]
     assert right.num_objects[1] > 0.8 and right.num_unknown[1] > 0.99
-    assert (smc.step._cache_size(), smc.init._cache_size(), smc.refresh._cache_size()) == traces
+    assert (smc.step._cache_size(), smc.init._cache_size(), smc.rejuvenated._cache_size()) == traces
 
 
 def test_what_is_of_a_type_that_is_left_out_is_unknown(parser, library):

@@ -191,7 +191,7 @@ def run_sampler(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProbl
         log_mass.append(float(state.log_evidence) + problem.log_count[number])
         if number and log_mass[-1] > max(log_mass) - NEGLIGIBLE:
             refresh_key = jax.random.fold_in(key, 2000 + number)
-            state = smc.refresh(
+            state = smc.rejuvenated(
                 refresh_key,
                 state,
                 jnp.int32(number),

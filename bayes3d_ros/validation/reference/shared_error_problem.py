@@ -249,9 +249,9 @@ def run_shared_sampler(
     """The posterior given an image of numpy arrays: every number of objects, of weight P(n) Z_n, as `SceneParser` finds
     them, but for numbers that it leaves out as unlikely."""
     context = Context(jax.device_put(image), problem.library, problem.table)
-    lead = None if problem.settings.unknown else with_unknown(image, jax.device_get(model.image))
+    guide = None if problem.settings.unknown else with_unknown(image, jax.device_get(model.image))
     most = problem.settings.max_objects
-    runs = sampler_runs(key, context, model, lead, problem.settings, most, -NEGLIGIBLE)
+    runs = sampler_runs(key, context, model, guide, problem.settings, most, -NEGLIGIBLE)
     best = likeliest(runs)
     stages, log_mass = [], []
     margin = np.asarray(model.image.table_margin, np.float64)
