@@ -8,9 +8,9 @@
 
 from launch import LaunchDescription
 
-from bayes3d_ros.ros.launching import LIBRARY, node_description
+from bayes3d_ros.ros.launching import LIBRARY, PLANNING_SCENE, node_description
 
 
 def generate_launch_description() -> LaunchDescription:
     """The launch description; `ros2 launch bayes3d_ros bayes3d.launch.py --show-args` lists the arguments."""
-    return node_description("scene_parser", [LIBRARY], rviz=True)
+    return node_description("scene_parser", [LIBRARY], [PLANNING_SCENE], rviz=True)

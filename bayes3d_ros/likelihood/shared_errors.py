@@ -11,8 +11,9 @@ image, a square of a few pixels:
 b is the error of a cell: N(0, tau^2), that of the table's surface as the camera sees it, or N(0, model^2), that of an
 object's model. With probability pi an object's cell is bad (dents, wear, bled edges), about the surface
 d + phi . a_object. Half of the bad ones are off as a whole, b ~ U(-`BAD_DEPTH`, 0), towards the camera, since cameras
-do not see through solids. The other half are planes of their own, as blocks of unknown things are (`own_plane.py`): dents have slopes. Their density is
-times exp(-`SEEN_THROUGH_NATS` x) where their median lies more than `SEEN_THROUGH` behind that surface, x metres more.
+do not see through solids. The other half are planes of their own, as blocks of unknown things are (`own_plane.py`):
+dents have slopes. Their density is times exp(-`SEEN_THROUGH_NATS` x) where their median lies more than `SEEN_THROUGH`
+behind that surface, x metres more.
 a_object ~ N(0, diag(bias^2, lean^2, lean^2)) is a depth error that the whole object shares, with phi = (1, x, y),
 metres from the middle of its visible part: no object stands upright to the degree. w are waves over the object, a
 Gaussian process with covariance wave^2 exp(-distance / length), by Vecchia's approximation (Vecchia 1988,

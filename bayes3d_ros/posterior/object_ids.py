@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from bayes3d_ros.posterior.types import ObjectEstimate, ScenePosterior
 
 SAME_PLACE = 0.05  # metres between two images, within which an object of the same type is the same one
-REMEMBERED_NS = 10 * 10**9  # between the stamps of two images, after which an object that was not seen is forgotten
+REMEMBERED_NS = 10 * 10**9  # after it was last seen (stamps of images): a scene that lacks it then forgets an object
 
 
 class NamedObject(NamedTuple):
@@ -39,14 +39,11 @@ def named(memory: IdMemory, posterior: ScenePosterior) -> tuple[tuple[str, ...],
 
     An object keeps the id of a remembered object of the same type within SAME_PLACE of it, in the frame of the
     poses. Objects are paired one to one: as many pairs as possible, and of these the smallest sum of distances. All
-    other objects get new ids, in the order of `objects`. A forgotten id is not given again. Objects seen in another
-    frame are forgotten.
+    other objects get new ids, in the order of `objects`. A scene forgets the objects that it lacks and that were last
+    seen more than REMEMBERED_NS before it: so what stands still keeps its id, however rarely a scene is parsed. A
+    forgotten id is not given again. Objects seen in another frame are forgotten.
     """
-    known = [
-        thing
-        for thing in memory.objects
-        if memory.frame_id == posterior.pose_frame_id and abs(posterior.stamp_ns - thing.seen_ns) <= REMEMBERED_NS
-    ]
+    known = memory.objects if memory.frame_id == posterior.pose_frame_id else ()
     ids = _kept(known, posterior.objects)
     counts = Counter(dict(memory.counts))
     for k, found in enumerate(posterior.objects):
@@ -57,7 +54,8 @@ def named(memory: IdMemory, posterior: ScenePosterior) -> tuple[tuple[str, ...],
         NamedObject(ids[k], found.type, np.asarray(found.position, float), posterior.stamp_ns)
         for k, found in enumerate(posterior.objects)
     ]
-    unseen = [thing for thing in known if thing.id not in ids.values()]
+    kept, latest = set(ids.values()), posterior.stamp_ns
+    unseen = [o for o in known if o.id not in kept and abs(latest - o.seen_ns) <= REMEMBERED_NS]
     objects = tuple(sorted((*seen, *unseen), key=lambda thing: thing.id))
     remembered = IdMemory(posterior.pose_frame_id, objects, tuple(sorted(counts.items())))
     return tuple(ids[k] for k in range(len(posterior.objects))), remembered

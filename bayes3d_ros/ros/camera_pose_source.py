@@ -44,7 +44,9 @@ class CameraPoseSource:
     Nothing is extrapolated, and a pose is not used for other stamps, unless it is static: of stamp 0, of a latched
     publisher, of /tf_static, or the parameter's, which counts only where neither the topic nor tf is in use.
 
-    `required`: an image waits for its pose even if nobody seems to send one. `on_pose` is called after every pose.
+    `required`: an image waits for its pose even if nobody seems to send one. So it does in the first `patience`
+    seconds, when who publishes is hardly known. `on_pose` is called after every pose. `static`: a pose that was heard
+    before, and holds until another one comes.
     """
 
     def __init__(
@@ -53,11 +55,13 @@ class CameraPoseSource:
         settings: DepthInputSettings,
         required: bool,
         on_pose: Callable[[], None],
+        static: Float[np.ndarray, "4 4"] | None = None,
     ) -> None:
         self._table_frame, self._tolerance, self._on_new = settings.table_frame, settings.pose_tolerance, on_pose
         self._fixed = matrix_from_values(list(settings.camera_pose)) if settings.camera_pose else None
         self._required = required and self._fixed is None
-        self._history = PoseHistory(settings.pose_max_gap, settings.patience + _HISTORY)
+        self._history = PoseHistory(settings.pose_max_gap, settings.patience + _HISTORY, static)
+        self._known_from = time.monotonic() + settings.patience
         self.refused = ""  # what is wrong with the newest message on the topic
         self._topic = AutoSubscription(
             node,
@@ -69,11 +73,17 @@ class CameraPoseSource:
             latched=True,
         )
         self._tf: TfPoses | None = tf_poses(node, settings.table_frame)
+        self._topic.look()
 
     @property
     def topic(self) -> str:
         """The resolved name of the topic."""
         return self._topic.topic
+
+    @property
+    def static(self) -> Float[np.ndarray, "4 4"] | None:
+        """The pose on the topic that holds for any stamp, or None."""
+        return self._history.static
 
     @property
     def publishers(self) -> tuple[str, ...]:
@@ -133,7 +143,9 @@ class CameraPoseSource:
 
     def _awaited(self, camera_frame: str) -> bool:
         """Whether a pose for an image may still come."""
-        return bool(self.publishers) or self._required or (self._tf is not None and self._tf.connects(camera_frame))
+        if self.publishers or self._required or (self._tf is not None and self._tf.connects(camera_frame)):
+            return True
+        return time.monotonic() < self._known_from
 
     def _fallback(self, stamp_ns: int, camera_frame: str) -> CameraPose:
         """The best pose for a stamp that neither the topic nor tf knows."""
@@ -154,6 +166,8 @@ class CameraPoseSource:
         nearest = self._history.nearest(stamp_ns)
         if self._topic.problem:
             reasons.append(self._topic.problem)
+        elif self._topic.other_type:
+            reasons.append(f"{self.topic}: {self._topic.other_type}")
         elif self.refused and self.publishers:
             reasons.append(self.refused)
         elif nearest is not None:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
@@ -42,11 +44,23 @@ class DepthMessages(NamedTuple):
             raise ValueError(f"{self.topic}: {error}") from None
 
 
+class Heard(NamedTuple):
+    """What may come once and then holds: the newest CameraInfo and when it came (time.monotonic), and a static pose on
+    the topic camera_pose (T_table_camera)."""
+
+    info: CameraInfo | None
+    info_at: float | None
+    static_pose: Float[np.ndarray, "4 4"] | None
+
+
+NOTHING_HEARD = Heard(None, None, None)
+
+
 class DepthInputs:
     """Calls `deliver` for images as they become complete; see input_queue.py and camera_pose_source.py.
 
     `use_pose`: no, yes, or required: then an image waits for a pose even if nobody seems to send one. `wants_pose` is
-    asked for every image; without it none waits for a pose.
+    asked for every image; without it none waits for a pose. `heard`: what earlier inputs of the same topics heard.
     """
 
     def __init__(
@@ -56,18 +70,21 @@ class DepthInputs:
         settings: DepthInputSettings,
         use_pose: str = "yes",
         wants_pose: Callable[[], bool] = lambda: True,
+        heard: Heard = NOTHING_HEARD,
     ) -> None:
         self._deliver, self._wants_pose = deliver, wants_pose
         self._queue: InputQueue[DepthMessage, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
         self.received, self.delivered = 0, 0
         self._delivered_at: float | None = None
         self._depth_at: float | None = None
-        self._info_at: float | None = None
+        self._info_at = heard.info_at
+        if heard.info is not None:
+            self._queue.remember_info(heard.info)
         self._next_poll = 0.0
         self._pose_used = NO_POSE
         self._poses: CameraPoseSource | None = None
         if use_pose != "no":
-            self._poses = CameraPoseSource(node, settings, use_pose == "required", self._on_pose)
+            self._poses = CameraPoseSource(node, settings, use_pose == "required", self._on_pose, heard.static_pose)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # with use_sim_time and no /clock the others stand still
         self._node = node
         self._looking = node.create_timer(_LOOK, self._look, clock=steady)
@@ -97,7 +114,8 @@ class DepthInputs:
         def topic(subscription: AutoSubscription, heard: float | None) -> TopicView:
             subscription.look()
             age = None if heard is None else now - heard
-            return TopicView(subscription.topic, subscription.publishers, age, subscription.problem)
+            seen = TopicView(subscription.topic, subscription.publishers, age, subscription.problem)
+            return replace(seen, remedy=subscription.other_type) if subscription.other_type else seen
 
         image = topic(self._image_topic, self._depth_at)
         remedy = "" if image.publishers else other_transport(self._node, self._transport)
@@ -112,6 +130,11 @@ class DepthInputs:
             pose_publishers=() if self._poses is None else self._poses.publishers,
             stamps_agree=self._queue.stamps_agree,
         )
+
+    @property
+    def heard(self) -> Heard:
+        """What later inputs of the same topics must not lose."""
+        return Heard(self._queue.latest_info, self._info_at, None if self._poses is None else self._poses.static)
 
     def close(self) -> None:
         """Stop listening; what waits is dropped."""

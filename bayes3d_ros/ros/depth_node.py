@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.jax_runtime import enable_cache
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import load_library
-from bayes3d_ros.ros.depth_inputs import DepthInputs, DepthMessages
+from bayes3d_ros.ros.depth_inputs import NOTHING_HEARD, DepthInputs, DepthMessages
 from bayes3d_ros.ros.diagnostics import Health, InputView, judge, judge_on_request, one_line
 from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.parameters import SettingsParameters
@@ -51,6 +51,7 @@ class DepthNodeParts:
         self.settings = SettingsParameters(node, kinds)
         self.inputs: DepthInputs | None = None
         self._received_before, self._delivered_before, self._dropped_before = 0, 0, 0
+        self._heard, self._heard_table = NOTHING_HEARD, ""  # by earlier inputs, with their table_frame
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.add_on_set_parameters_callback(self._on_set_parameters)
         node.add_post_set_parameters_callback(self._after_set_parameters)
@@ -82,12 +83,15 @@ class DepthNodeParts:
         """Subscribe to the depth inputs as the parameters are now; see DepthInputs. Earlier inputs are closed."""
         self.close_inputs()
         settings = self.settings.in_use(DepthInputSettings)
-        self.inputs = DepthInputs(self._node, deliver, settings, use_pose, wants_pose)
+        if settings.table_frame != self._heard_table:
+            self._heard, self._heard_table = self._heard._replace(static_pose=None), settings.table_frame
+        self.inputs = DepthInputs(self._node, deliver, settings, use_pose, wants_pose, self._heard)
 
     def close_inputs(self) -> None:
         """Stop listening; the counts stay."""
         if self.inputs is not None:
             self.inputs.close()
+            self._heard = self.inputs.heard
             self._received_before += self.inputs.received
             self._delivered_before += self.inputs.delivered
             self._dropped_before += self.inputs.dropped
@@ -106,7 +110,8 @@ class DepthNodeParts:
             self._node.get_logger().warning(f"no image so far: {report.status[0].message}")
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        reason = self._forbids(parameters)
+        deleted = [p.name for p in parameters if p.type_ == Parameter.Type.NOT_SET]
+        reason = f"{deleted[0]} cannot be deleted; set it to its default" if deleted else self._forbids(parameters)
         return SetParametersResult(successful=False, reason=reason) if reason else self.settings.check(parameters)
 
     def _after_set_parameters(self, parameters: list[Parameter]) -> None:

@@ -117,6 +117,15 @@ class InputQueue(Generic[ImageT, InfoT, PoseT]):
         _remember(self._infos, stamp_ns, (info, now))
         self._compare(stamp_ns)
 
+    @property
+    def latest_info(self) -> InfoT | None:
+        """The newest CameraInfo."""
+        return self._latest
+
+    def remember_info(self, info: InfoT) -> None:
+        """The newest CameraInfo before this queue was made."""
+        self._latest = info
+
     def poses_changed(self) -> None:
         """Poses may be known now that were not: the next `take` asks for those of all images that wait."""
         self._poses_known += 1

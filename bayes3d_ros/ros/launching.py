@@ -42,6 +42,11 @@ class Argument(NamedTuple):
     description: str
 
 
+PLANNING_SCENE = Argument(
+    "planning_scene_topic",
+    "~/planning_scene",
+    "topic of the planning scene, with planning_scene: true in params_file; MoveIt listens to /planning_scene",
+)
 LIBRARY = Argument("library", "", "folder of object models; empty: what params_file says")
 _SHARED = (
     Argument("namespace", "", "namespace of the node and its topics; of the bag's topics too, where bag is given"),
@@ -76,12 +81,16 @@ _RVIZ = (
 )
 
 
-def node_description(node: str, parameters: Iterable[Argument], rviz: bool = False) -> LaunchDescription:
-    """Starts a node of this package with depth inputs. `parameters`: arguments that are parameters of the node too."""
+def node_description(
+    node: str, parameters: Iterable[Argument], outputs: Iterable[Argument] = (), rviz: bool = False
+) -> LaunchDescription:
+    """Starts a node of this package with depth inputs. `parameters`: arguments that are parameters of the node too;
+    `outputs`: arguments that name topics of its outputs, whose defaults are the node's own names."""
     params_file = str(share_directory() / "config" / f"{node}.yaml")
-    parameters = tuple(parameters)
+    parameters, outputs = tuple(parameters), tuple(outputs)
     arguments = (
         *parameters,
+        *outputs,
         Argument("node_name", node, "name of the node"),
         Argument("params_file", params_file, "parameters of the node; the arguments that are given win over it"),
         *_SHARED,
@@ -91,13 +100,21 @@ def node_description(node: str, parameters: Iterable[Argument], rviz: bool = Fal
 
     def start(context: LaunchContext) -> list[Any]:
         # All of it is worked out before anything is started: what fails here leaves no process behind.
-        return _actions(context, node, {a.name: LaunchConfiguration(a.name).perform(context) for a in arguments}, given)
+        values = {a.name: LaunchConfiguration(a.name).perform(context) for a in arguments}
+        renamed = [(a.default, values[a.name]) for a in outputs if values[a.name] != a.default]
+        return _actions(context, node, values, given, renamed)
 
     declared = [DeclareLaunchArgument(a.name, default_value=a.default, description=a.description) for a in arguments]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
-def _actions(context: LaunchContext, executable: str, values: dict[str, str], parameters: list[str]) -> list[Any]:
+def _actions(
+    context: LaunchContext,
+    executable: str,
+    values: dict[str, str],
+    parameters: list[str],
+    outputs: list[tuple[str, str]],
+) -> list[Any]:
     name, bag = values["node_name"], values["bag"] and str(_existing("bag", values["bag"]))
     outer = context.launch_configurations.get("ros_namespace")  # of PushRosNamespace in a launch file that includes us
     namespace = make_namespace_absolute(prefix_namespace(outer, values["namespace"])) or "/"
@@ -117,7 +134,7 @@ def _actions(context: LaunchContext, executable: str, values: dict[str, str], pa
             str(_existing("params_file", values["params_file"])),
             {key: ParameterValue(values[key], value_type=str) for key in parameters if values[key]},
         ],
-        remappings=[*((INPUTS[key], topics[key]) for key in INPUTS), *tf],
+        remappings=[*((INPUTS[key], topics[key]) for key in INPUTS), *outputs, *tf],
         arguments=["--ros-args", "--log-level", values["log_level"]],
         additional_env=environment,
     )

@@ -36,15 +36,15 @@ class PoseHistory:
 
     `static` is a pose that holds for any stamp: the last one with stamp 0, or the last one of a latched
     (transient_local) publisher. Any other pose that comes later replaces it. Latched poses that follow each other
-    quickly are of a camera that moves, and none of them is static.
+    quickly are of a camera that moves, and none of them is static. The argument `static` is one that came before.
     """
 
-    def __init__(self, max_gap: float, keep: float) -> None:
+    def __init__(self, max_gap: float, keep: float, static: Matrix | None = None) -> None:
         self._max_gap_ns, self._keep_ns = int(max_gap * 1e9), int(keep * 1e9)
         self._stamps: list[int] = []  # ascending
         self._poses: dict[int, tuple[Matrix, float]] = {}  # the pose, and when it arrived
         self._latched: _Latched | None = None
-        self._static: Matrix | None = None
+        self._static = static
 
     @property
     def static(self) -> Matrix | None:

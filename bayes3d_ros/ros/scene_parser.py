@@ -22,6 +22,7 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, prepare_jax
 from bayes3d_ros.ros.diagnostics import ERROR, QUIET, WARN, InputView, one_line
+from bayes3d_ros.ros.lifecycle_requests import refuse_wrong_transitions
 from bayes3d_ros.ros.node_settings import (
     FIXED_WHILE_ACTIVE,
     INPUT_PARAMETERS,
@@ -67,10 +68,11 @@ class SceneParserNode(Node):
         self._in_use = ParserInUse()
         self._preparation = ParserPreparation(self, self._parts, self._in_use, make_parser, self._on_prepared)
         self._frames: OutputFrames | None = None  # there while inputs are
-        self._transforms: ObjectTransforms | None = None  # there while inputs are, with publish_tf
+        self._transforms: ObjectTransforms | None = None  # from the first publish_tf on
         self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
         self._ids = IdMemory()  # the worker's alone
         self._outputs = ScenePublishers(self)
+        refuse_wrong_transitions(self)
         self._parse = ParseService(self, self._parse_timeout, self._why_not, self._why_late)
         self.create_service(Trigger, "~/reload_library", self._on_reload)
         if self.get_parameter("autostart").value:
@@ -169,20 +171,24 @@ class SceneParserNode(Node):
         self._close_frames()
 
     def _open_frames(self) -> None:
-        self._close_frames()
+        """Outputs as the parameters are now. A planner keeps its obstacles until the next scene replaces them."""
         settings = self._parts.settings.in_use(SceneParserNodeSettings)
+        self._close_frames(publish_tf=settings.publish_tf, planning_scene=settings.planning_scene)
         self._frames = OutputFrames(self, settings)
-        self._transforms = ObjectTransforms(self) if settings.publish_tf else None
-        self._planning = PlanningScenePublisher(self) if settings.planning_scene else None
+        if settings.publish_tf:
+            self._transforms = self._transforms or ObjectTransforms(self)
+            self._transforms.resume()
+        if settings.planning_scene and self._planning is None:
+            self._planning = PlanningScenePublisher(self)
 
-    def _close_frames(self) -> None:
+    def _close_frames(self, *, publish_tf: bool = False, planning_scene: bool = False) -> None:
+        """Close the outputs that are not wanted, and those that hold only for the parameters that they began with."""
         if self._frames is not None:
             self._frames.close()
             self._frames = None
-        if self._transforms is not None:
-            self._transforms.close()
-            self._transforms = None
-        if self._planning is not None:
+        if self._transforms is not None and not publish_tf:
+            self._transforms.pause()
+        if self._planning is not None and not planning_scene:
             self._planning.close()
             self._planning = None
 
@@ -203,7 +209,7 @@ class SceneParserNode(Node):
         elif self._preparation.begun and names & {*PER_FRAME}:
             self._in_use.adjust(self._parts.settings.in_use(ParserSettings))
         if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:
-            self._close_inputs()
+            self._parts.worker.forget()
             self._open_inputs()
         elif self._parts.inputs is not None and names & {*OUTPUT_FRAME_PARAMETERS}:
             self._open_frames()

@@ -47,13 +47,16 @@ class AutoSubscription:
         self._change_over = False
         self._want_latched = latched
         self._publishers: list[TopicEndpointInfo] = []
+        self._type = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
+        self.other_type = ""  # where all publishers are of another type: which is expected, and which it is
         self._volatile: Subscription = self._subscribe(DurabilityPolicy.VOLATILE)
         self._latched: Subscription | None = None
         self.problem = ""  # why a publisher cannot be heard
 
     @property
     def publishers(self) -> tuple[str, ...]:
-        """The nodes that publish on the topic, as /namespace/name, one entry a publisher, as of the last look."""
+        """The nodes that publish the expected type on the topic, as /namespace/name, one entry a publisher, as of the
+        last look."""
         return tuple(full_name(p.node_namespace, p.node_name) for p in self._publishers)
 
     def look(self) -> None:
@@ -63,7 +66,10 @@ class AutoSubscription:
             self.close()
             self._volatile = self._subscribe(DurabilityPolicy.VOLATILE)
             self._node.get_logger().info(f"a publisher on {self.topic} is best effort: subscribing best effort")
-        self._publishers = self._node.get_publishers_info_by_topic(self.topic)
+        everybody = self._node.get_publishers_info_by_topic(self.topic)
+        self._publishers = [p for p in everybody if p.topic_type == self._type]
+        others = {p.topic_type for p in everybody} - {self._type} if not self._publishers else ()
+        self.other_type = f"it has type {', '.join(sorted(others))}, expected {self._type}" if others else ""
         latched = any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in self._publishers)
         if self._want_latched and latched and self._latched is None:
             self._latched = self._subscribe(DurabilityPolicy.TRANSIENT_LOCAL)

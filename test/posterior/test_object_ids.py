@@ -65,10 +65,16 @@ def test_pairs_are_one_to_one_and_as_many_as_can_be(scene) -> None:
 
 
 @pytest.mark.parametrize(("unseen", "kept"), [(10.0, True), (10.001, False), (-9.0, True), (-11.0, False)])
-def test_an_object_that_was_not_seen_for_ten_seconds_is_forgotten(scene, unseen: float, kept: bool) -> None:
+def test_a_scene_forgets_what_it_lacks_and_was_not_seen_for_ten_seconds(scene, unseen: float, kept: bool) -> None:
     """By the stamps of images, also where they jump back; what was forgotten is another one, of another id."""
-    _, _, third = follow(scene(20, ("can", 0.0)), scene(20, ("bowl", 0.0)), scene(20 + unseen, ("can", 0.0)))
+    lacks_it, again = scene(20 + unseen, ("bowl", 0.0)), scene(20 + unseen, ("can", 0.0))
+    _, _, third = follow(scene(20, ("can", 0.0)), lacks_it, again)
     assert third == (("can_1",) if kept else ("can_2",))
+
+
+def test_what_stands_still_keeps_its_id_however_rarely_a_scene_is_parsed(scene) -> None:
+    """Calls of ~/parse may be minutes apart."""
+    assert set(follow(*(scene(100 * k, ("can", 0.0)) for k in range(5)))) == {("can_1",)}
 
 
 def test_an_object_that_creeps_keeps_its_id(scene) -> None:

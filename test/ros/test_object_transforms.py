@@ -67,8 +67,14 @@ def posterior(depth_frame, fake_posterior):
     return replace(fake_posterior(depth_frame(12_345), ("bowl", "can")), T_camera_table=T_camera_table)
 
 
-def test_transforms_are_the_poses_below_the_frame_that_they_are_told_in(tf, node, posterior) -> None:
+def listening(node) -> ObjectTransforms:
     transforms = ObjectTransforms(node)
+    transforms.resume()
+    return transforms
+
+
+def test_transforms_are_the_poses_below_the_frame_that_they_are_told_in(tf, node, posterior) -> None:
+    transforms = listening(node)
     for told, parent in ((posterior, "camera"), (in_frame(posterior, table_frame(posterior)), "table")):
         tf.sent.clear()
         transforms.send(told, IDS)
@@ -78,14 +84,14 @@ def test_transforms_are_the_poses_below_the_frame_that_they_are_told_in(tf, node
             expected = pose_matrix(found.position, found.orientation)
             np.testing.assert_allclose(transform_to_matrix(sent.transform), expected, atol=1e-12)
     assert not node.told  # what tf has from this node is its own
-    transforms.close()
+    transforms.pause()
     assert tf.listening == 0
 
 
 @pytest.mark.parametrize("others", [{"left/scene_parser/bowl_1": "world"}, {"gripper": "left/scene_parser/bowl_1"}])
 def test_a_frame_that_tf_has_is_never_sent_and_a_line_says_so_once(tf, node, posterior, others) -> None:
     tf.frames |= others
-    transforms = ObjectTransforms(node)
+    transforms = listening(node)
     for _ in range(3):
         transforms.send(posterior, IDS)
     assert {t.child_frame_id for t in tf.sent} == {"left/scene_parser/can_1"}
@@ -94,7 +100,7 @@ def test_a_frame_that_tf_has_is_never_sent_and_a_line_says_so_once(tf, node, pos
 
 
 def test_a_frame_that_somebody_else_begins_to_send_is_left_to_them(tf, node, posterior) -> None:
-    transforms = ObjectTransforms(node)
+    transforms = listening(node)
     transforms.send(posterior, IDS)
     tf.frames["left/scene_parser/can_1"] = "world"
     tf.sent.clear()
@@ -102,9 +108,23 @@ def test_a_frame_that_somebody_else_begins_to_send_is_left_to_them(tf, node, pos
     assert {t.child_frame_id for t in tf.sent} == {"left/scene_parser/bowl_1"} and len(node.told) == 1
 
 
+def test_after_a_pause_the_frames_are_still_this_nodes_own(tf, node, posterior) -> None:
+    """What was sent before is in tf for ever."""
+    transforms = listening(node)
+    transforms.send(posterior, IDS)
+    transforms.pause()
+    tf.sent.clear()
+    transforms.send(posterior, IDS)  # a scene that was being parsed meanwhile
+    assert not tf.sent and tf.listening == 0
+    transforms.resume()
+    transforms.resume()
+    transforms.send(posterior, IDS)
+    assert len(tf.sent) == 2 and not node.told and tf.listening == 1
+
+
 def test_without_tf2_ros_a_line_says_that_nothing_is_sent(node, posterior, monkeypatch) -> None:
     monkeypatch.setattr(object_transforms, "tf2_ros", None)
-    transforms = ObjectTransforms(node)
+    transforms = listening(node)
     transforms.send(posterior, IDS)
-    transforms.close()
+    transforms.pause()
     assert node.told == ["publish_tf: tf: tf2_ros is not installed; no transforms are sent"]

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from camera_rig import INTRINSICS
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, PoseStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -191,6 +191,59 @@ def test_a_changed_setting_is_checked_and_taken(bench: Bench) -> None:
     assert set_parameter("camera_pose", []).successful
     assert set_parameter("table", "auto").successful
     bench.frames_are_parsed()
+
+
+@pytest.mark.parametrize("name", ["camera_pose", "types", "region", "camera_pose_sigma"])
+def test_a_parameter_cannot_be_deleted(bench: Bench, name: str) -> None:
+    request = SetParameters.Request(parameters=[Parameter(name, Parameter.Type.NOT_SET).to_parameter_msg()])
+    (result,) = bench.ros.call(SetParameters, "/scene_parser/set_parameters", request).results
+    assert not result.successful and result.reason == f"{name} cannot be deleted; set it to its default"
+    bench.good_frame_is_parsed()
+
+
+@pytest.mark.parametrize("transition", [1, 3, 2, 99], ids=["configure", "activate", "cleanup", "unknown"])
+def test_a_transition_that_does_not_fit_the_state_is_refused(bench: Bench, transition: int) -> None:
+    request = ChangeState.Request()
+    request.transition.id = transition
+    assert not bench.ros.call(ChangeState, "/scene_parser/change_state", request).success
+    bench.good_frame_is_parsed()
+
+
+def test_a_topic_of_another_type_is_named(ros, library_folder: Path) -> None:
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.node.create_publisher(CompressedImage, "/typed/depth/image_rect", 10)
+    ros.start_parser(library_folder, namespace="/typed")
+    why = "it has type sensor_msgs/msg/CompressedImage, expected sensor_msgs/msg/Image"
+    ros.wait_for_diagnosis(diagnostics, why, "/typed/scene_parser: scene parsing")
+
+
+def test_what_came_once_outlives_a_parameter(ros, library_folder: Path) -> None:
+    """A static pose and a CameraInfo, whose publishers are gone when a parameter of the inputs is set."""
+    ros.start_parser(library_folder, namespace="/once")
+    camera, poses = ros.camera("/once"), ros.listen(PoseArray, "/once/scene_parser/poses")
+    camera.wait_for_subscriber()
+    publisher = ros.node.create_publisher(PoseStamped, "/once/camera_pose", 10)
+    ros.wait_for(publisher.get_subscription_count, "a subscriber of the pose")
+    static = PoseStamped()
+    static.pose.position.z, static.pose.orientation.x, static.pose.orientation.w = 3.0, 1.0, 0.0
+    publisher.publish(static)
+    stamp = SECOND
+
+    def height() -> float:
+        nonlocal stamp
+        stamp += SECOND
+        count = len(poses)
+        camera.send(camera.messages(depth_frame(stamp))[0], info if count == 0 else None)
+        ros.wait_for(lambda: len(poses) > count, "an output")
+        return poses[-1].poses[0].position.z
+
+    _, info = camera.messages(depth_frame(stamp + SECOND))
+    assert height() == 3.0  # the fake parser puts its object at the camera's height
+    ros.node.destroy_publisher(publisher)
+    request = SetParameters.Request(parameters=[Parameter("pose_tolerance", value=0.1).to_parameter_msg()])
+    assert ros.call(SetParameters, "/once/scene_parser/set_parameters", request).results[0].successful
+    camera.wait_for_subscriber()
+    assert height() == 3.0
 
 
 def test_a_retired_parameter_keeps_the_node_unconfigured_until_the_new_one_is_set(ros, library_folder: Path) -> None:
