@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -19,6 +19,7 @@ from bayes3d_ros.ros.summary import key_values
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 QUIET = 3.0  # seconds without a message, or without an output, after which that is told
 REPEAT = 10.0  # seconds after which a line of the same kind is logged again
+LOOK = 1.0  # seconds between two frames that nobody asked for and that are looked at
 _KINDS = 100  # kinds of lines that are remembered
 
 
@@ -132,6 +133,7 @@ class Health:
         self._latency, self._seconds, self._ess = 0.0, 0.0, ""
         self._warnings: tuple[str, ...] = ()
         self._usable_share = math.nan
+        self._unusable, self._looked_at = "", -math.inf
         self.parsed, self.refused, self.discarded, self.unasked = 0, 0, 0, 0
         self.backend = ""
 
@@ -141,6 +143,7 @@ class Health:
             self._outputs.clear()
             self._began = time.monotonic()
             self._problem, self._problem_at, self._warnings = "", -math.inf, ()
+            self._unusable, self._looked_at = "", -math.inf
 
     def problem(self, text: str, kind: str = "") -> bool:
         """Note a frame that gave no output and why; True if that is worth a line in the log, where one line of a `kind`
@@ -155,10 +158,21 @@ class Health:
         with self._lock:
             self.discarded += 1
 
-    def pass_over(self) -> None:
-        """Note a frame that nobody asked for."""
+    def pass_over(self, why_unusable: Callable[[], str]) -> None:
+        """Note a frame that nobody asked for. Once in LOOK seconds `why_unusable` is asked why it could not be parsed
+        (one line, or empty), which takes time."""
+        now = time.monotonic()
+        look = now - self._looked_at >= LOOK
+        why = why_unusable() if look else self._unusable
         with self._lock:
             self.unasked += 1
+            if look:
+                self._unusable, self._looked_at = why, now
+
+    @property
+    def unusable(self) -> str:
+        """Why the frames that nobody asked for could not be parsed; empty where they could."""
+        return self._unusable
 
     def output(
         self,
@@ -274,6 +288,8 @@ def judge_on_request(health: Health, view: InputView, *, idle: bool) -> tuple[by
         return WARN, told
     if not view.delivering:
         return WARN, f"no image for a request: {where_images_are(view)}"
+    if idle and health.unusable:
+        return WARN, f"no image for a request: {health.unusable}"
     good = "waiting for a request (~/parse)" if idle else "parsing on request"
     failure = health.failure()
     told_of = [*input_warnings(view), *([f"the last request had no result: {failure}"] if failure else [])]

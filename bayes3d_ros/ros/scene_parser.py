@@ -5,6 +5,7 @@
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
@@ -223,7 +224,7 @@ class SceneParserNode(Node):
     def _on_image(self, messages: DepthMessages) -> None:
         """A complete image: for the worker, unless nobody asked for it."""
         if self._on_request and not self._parse.requests.want(messages.arrived):
-            self._parts.health.pass_over()
+            self._parts.health.pass_over(partial(_why_unusable, messages))
         else:
             self._parts.worker.submit(messages)
 
@@ -318,6 +319,14 @@ class SceneParserNode(Node):
         if view is None:
             return WARN, f"the node is {self._state_label()}; configure and activate it"
         return self._parts.judge_on_request(view) if self._on_request else self._parts.judge(view, good="parsing")
+
+
+def _why_unusable(messages: DepthMessages) -> str:
+    try:
+        messages.frame()
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def main(args: list[str] | None = None) -> int:

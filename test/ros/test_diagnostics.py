@@ -6,6 +6,7 @@ import pytest
 
 from bayes3d_ros.ros import diagnostics
 from bayes3d_ros.ros.diagnostics import (
+    LOOK,
     OK,
     WARN,
     Health,
@@ -143,7 +144,22 @@ def test_every_image_is_accounted_for() -> None:
         health.output(0.1, [1.0], 0.2)
     health.problem("no table")
     health.discard()
-    health.pass_over()
+    health.pass_over(lambda: "")
     report = health.report("n", OK, "m", state="s", received=12, dropped=5, view=None)
     values = {pair.key: pair.value for pair in report.status[0].values}
     assert [values[k] for k in KEYS] == ["12", "3", "1", "6", "1", "1"]
+
+
+def test_frames_that_nobody_asked_for_are_looked_at_once_in_a_while(clock: list[float]) -> None:
+    health, looks = Health(), []
+
+    def why() -> str:
+        looks.append(clock[0])
+        return "K[0]: expected a focal length" if len(looks) < 2 else ""
+
+    for _ in range(3):
+        health.pass_over(why)
+    assert len(looks) == 1 and health.unusable.startswith("K[0]")
+    clock[0] += LOOK
+    health.pass_over(why)
+    assert len(looks) == 2 and not health.unusable and health.unasked == 4

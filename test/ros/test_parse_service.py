@@ -107,6 +107,16 @@ def test_two_clients_at_once_share_one_image_that_came_after_them(waiting: Robot
     assert counts["parsed"] == 1 and counts["unasked"] > 0
 
 
+def test_it_is_not_ok_when_no_image_can_be_used(waiting: Robot) -> None:
+    """Said before anybody asks: the CameraInfo of another camera."""
+    camera, ros = waiting.camera, waiting.ros
+    image, info = camera.messages(depth_frame(10_000))
+    info.width = 32
+    why = "no image for a request: /depth/image_rect: CameraInfo width, height: expected the image's 64x48"
+    send = lambda: camera.send(image, info) or any(why in d.status[0].message for d in waiting.diagnostics)  # noqa: E731
+    ros.wait_for(send, "the line", pause=0.2)
+
+
 def test_it_is_not_ok_when_images_stop(waiting: Robot) -> None:
     report = waiting.ros.wait_for_diagnosis(waiting.diagnostics, "no message on /depth/image_rect")
     assert report.status[0].level == WARN
