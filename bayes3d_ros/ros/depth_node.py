@@ -7,8 +7,9 @@ A node holds one of these helpers and does not inherit from it: one of the three
 
 import contextlib
 import os
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -48,6 +49,7 @@ class DepthNodeParts:
         forbids: Callable[[list[Parameter]], str] = lambda parameters: "",
     ) -> None:
         self._node, self._changed, self._forbids = node, changed, forbids
+        self._report = report
         self.settings = SettingsParameters(node, kinds)
         self.inputs: DepthInputs | None = None
         self._received_before, self._delivered_before, self._dropped_before = 0, 0, 0
@@ -96,6 +98,23 @@ class DepthNodeParts:
             self._delivered_before += self.inputs.delivered
             self._dropped_before += self.inputs.dropped
             self.inputs = None
+
+    @contextlib.contextmanager
+    def reporting(self) -> Iterator[None]:
+        """Publish the report from a thread of its own: for what keeps the executor busy for long."""
+        done = threading.Event()
+
+        def report() -> None:
+            while not done.wait(_REPORT_PERIOD):
+                self._diagnostics.publish(self._report())
+
+        thread = threading.Thread(target=report, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
 
     def stop(self, timeout: float) -> bool:
         """There is no thread to wait for."""

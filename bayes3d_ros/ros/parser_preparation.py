@@ -66,7 +66,11 @@ class ParserPreparation:
         """Make a parser now; takes seconds to minutes. Raises ValueError or LibraryError where the parameters allow
         none, and whatever compiling raises."""
         library, settings = self._load()
-        self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
+        self._since = time.monotonic()
+        try:
+            self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
+        finally:
+            self._since = None
         self._libraries = (library,)
 
     def begin(self) -> str:

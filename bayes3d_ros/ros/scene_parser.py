@@ -84,8 +84,14 @@ class SceneParserNode(Node):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the library and compile, unless that has been done already."""
         try:
+            if self._ready is None and self._preparation.seconds is not None:
+                self.get_logger().warning(
+                    "configure is refused: the node compiles already; with autostart it configures itself"
+                )
+                return TransitionCallbackReturn.FAILURE
             if self._ready is None:
-                self._preparation.make()
+                with self._parts.reporting():
+                    self._preparation.make()
         except (ValueError, LibraryError) as error:
             self._parts.refuse(str(error))
             return TransitionCallbackReturn.FAILURE

@@ -209,6 +209,31 @@ def test_a_transition_that_does_not_fit_the_state_is_refused(bench: Bench, trans
     bench.good_frame_is_parsed()
 
 
+def test_configure_by_request_reports_while_it_compiles(ros, library_folder: Path) -> None:
+    name = "/managed/scene_parser"
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.start_parser(library_folder, "--compiling", "3", namespace="/managed", autostart=False)
+    request = ChangeState.Request()
+    request.transition.id = 1
+    client, future = ros.ask(ChangeState, f"{name}/change_state", request)
+    ros.wait_for_diagnosis(diagnostics, "compiling for the library, ", f"{name}: scene parsing")
+    assert not future.done()
+    ros.wait_for(future.done, "the end of configure")
+    assert future.result().success
+
+
+def test_configure_is_refused_while_the_node_compiles_by_itself(ros, library_folder: Path) -> None:
+    name = "/hasty/scene_parser"
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    process = ros.start_parser(library_folder, "--compiling", "4", namespace="/hasty")
+    ros.wait_for_diagnosis(diagnostics, "compiling for the library, ", f"{name}: scene parsing")
+    request = ChangeState.Request()
+    request.transition.id = 1
+    assert not ros.call(ChangeState, f"{name}/change_state", request).success
+    assert "configure is refused: the node compiles already" in process.output()
+    ros.wait_for_diagnosis(diagnostics, "no publisher on /hasty/depth/image_rect", f"{name}: scene parsing")
+
+
 def test_a_topic_of_another_type_is_named(ros, library_folder: Path) -> None:
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     ros.node.create_publisher(CompressedImage, "/typed/depth/image_rect", 10)
