@@ -72,7 +72,7 @@ class DepthInputs:
         wants_pose: Callable[[], bool] = lambda: True,
         heard: Heard = NOTHING_HEARD,
     ) -> None:
-        self._deliver, self._wants_pose = deliver, wants_pose
+        self._deliver, self._wants_pose, self._settings, self._heard = deliver, wants_pose, settings, heard
         self._queue: InputQueue[DepthMessage, CameraInfo, CameraPose] = InputQueue(settings.patience, self._find_pose)
         self.received, self.delivered = 0, 0
         self._delivered_at: float | None = None
@@ -131,10 +131,11 @@ class DepthInputs:
             stamps_agree=self._queue.stamps_agree,
         )
 
-    @property
-    def heard(self) -> Heard:
-        """What later inputs of the same topics must not lose."""
-        return Heard(self._queue.latest_info, self._info_at, None if self._poses is None else self._poses.static)
+    def heard(self, settings: DepthInputSettings) -> Heard:
+        """What inputs of the same topics and with these settings, that take the place of these, must not lose."""
+        static = self._heard.static_pose if self._poses is None else self._poses.static
+        same = settings.table_frame == self._settings.table_frame and settings.camera_pose == self._settings.camera_pose
+        return Heard(self._queue.latest_info, self._info_at, static if same else None)
 
     def close(self) -> None:
         """Stop listening; what waits is dropped."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -28,6 +29,7 @@ from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.parameters import SettingsParameters
 from bayes3d_ros.ros.worker import NewestWorker
 
+RCLError = rclpy_implementation.RCLError
 _REPORT_PERIOD = 1.0  # seconds between two messages on /diagnostics
 _SILENT_REPORTS = 5  # after so many without any image the log says why
 
@@ -53,7 +55,6 @@ class DepthNodeParts:
         self.settings = SettingsParameters(node, kinds)
         self.inputs: DepthInputs | None = None
         self._received_before, self._delivered_before, self._dropped_before = 0, 0, 0
-        self._heard, self._heard_table = NOTHING_HEARD, ""  # by earlier inputs, with their table_frame
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.add_on_set_parameters_callback(self._on_set_parameters)
         node.add_post_set_parameters_callback(self._after_set_parameters)
@@ -82,18 +83,17 @@ class DepthNodeParts:
         use_pose: str = "yes",
         wants_pose: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Subscribe to the depth inputs as the parameters are now; see DepthInputs. Earlier inputs are closed."""
-        self.close_inputs()
+        """Subscribe to the depth inputs as the parameters are now; see DepthInputs. Inputs that are open are closed,
+        and what they heard once is kept, but for a static pose where `table_frame` or `camera_pose` is another now."""
         settings = self.settings.in_use(DepthInputSettings)
-        if settings.table_frame != self._heard_table:
-            self._heard, self._heard_table = self._heard._replace(static_pose=None), settings.table_frame
-        self.inputs = DepthInputs(self._node, deliver, settings, use_pose, wants_pose, self._heard)
+        heard = NOTHING_HEARD if self.inputs is None else self.inputs.heard(settings)
+        self.close_inputs()
+        self.inputs = DepthInputs(self._node, deliver, settings, use_pose, wants_pose, heard)
 
     def close_inputs(self) -> None:
         """Stop listening; the counts stay."""
         if self.inputs is not None:
             self.inputs.close()
-            self._heard = self.inputs.heard
             self._received_before += self.inputs.received
             self._delivered_before += self.inputs.delivered
             self._dropped_before += self.inputs.dropped
@@ -105,8 +105,9 @@ class DepthNodeParts:
         done = threading.Event()
 
         def report() -> None:
-            while not done.wait(_REPORT_PERIOD):
-                self._diagnostics.publish(self._report())
+            while not done.wait(_REPORT_PERIOD) and self._node.context.ok():
+                with contextlib.suppress(RCLError):  # Ctrl-C meanwhile
+                    self._diagnostics.publish(self._report())
 
         thread = threading.Thread(target=report, daemon=True)
         thread.start()

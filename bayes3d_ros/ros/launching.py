@@ -101,7 +101,7 @@ def node_description(
     def start(context: LaunchContext) -> list[Any]:
         # All of it is worked out before anything is started: what fails here leaves no process behind.
         values = {a.name: LaunchConfiguration(a.name).perform(context) for a in arguments}
-        renamed = [(a.default, values[a.name]) for a in outputs if values[a.name] != a.default]
+        renamed = [(a.default, values[a.name]) for a in outputs if values[a.name] not in ("", a.default)]
         return _actions(context, node, values, given, renamed)
 
     declared = [DeclareLaunchArgument(a.name, default_value=a.default, description=a.description) for a in arguments]

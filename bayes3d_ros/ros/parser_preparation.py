@@ -66,7 +66,9 @@ class ParserPreparation:
         """Make a parser now; takes seconds to minutes. Raises ValueError or LibraryError where the parameters allow
         none, and whatever compiling raises."""
         library, settings = self._load()
+        self._requests += 1  # what the worker may be making is not wanted any more
         self._since = time.monotonic()
+        self._parts.refusal = ""
         try:
             self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
         finally:

@@ -84,10 +84,10 @@ class SceneParserNode(Node):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the library and compile, unless that has been done already."""
         try:
-            if self._ready is None and self._preparation.seconds is not None:
-                self.get_logger().warning(
-                    "configure is refused: the node compiles already; with autostart it configures itself"
-                )
+            compiling = self._preparation.seconds is not None
+            if self._ready is None and compiling and self.get_parameter("autostart").value:
+                told = "configure is refused: the node compiles already, and configures itself then (autostart)"
+                self.get_logger().warning(told)
                 return TransitionCallbackReturn.FAILURE
             if self._ready is None:
                 with self._parts.reporting():

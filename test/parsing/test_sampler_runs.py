@@ -67,9 +67,9 @@ def test_the_second_run_finds_neighbours_for_which_a_larger_object_stands(models
 def test_only_a_closed_world_has_a_second_run(parser, models):
     seen = observe(frame(), CLOSED)
     other = SceneParser(parser.library, replace(CLOSED, unknown=True))
-    assert models.lead is not None and other._context(seen.image, seen.errors, seen.table).lead is None
+    assert models.guide is not None and other._context(seen.image, seen.errors, seen.table).guide is None
     independent = SceneParser(parser.library, replace(CLOSED, likelihood="independent"))
-    assert independent._context(seen.image, None, seen.table).lead is None
+    assert independent._context(seen.image, None, seen.table).guide is None
 
 
 @pytest.mark.parametrize("count", [1, 2])
