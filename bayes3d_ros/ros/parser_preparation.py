@@ -66,9 +66,7 @@ class ParserPreparation:
         """Make a parser now; takes seconds to minutes. Raises ValueError or LibraryError where the parameters allow
         none, and whatever compiling raises."""
         library, settings = self._load()
-        self._requests += 1  # what the worker may be making is not wanted any more
-        self._since = time.monotonic()
-        self._parts.refusal = ""
+        self._supersede()
         try:
             self._in_use.put(make_bundle(self._make_parser, library, settings, self._size(), self._capacity))
         finally:
@@ -83,11 +81,9 @@ class ParserPreparation:
             if self._in_use.bundle is None:
                 self._parts.refuse(str(error))
             return str(error)
-        self._requests += 1
+        self._supersede()
         request, capacity = self._requests, self._capacity
         self._libraries = (*self._libraries_in_use(), library)
-        self._since = time.monotonic()
-        self._parts.refusal = ""
         self._node.get_logger().info(f"preparing a parser for {len(library.models)} object types")
 
         def job() -> None:
@@ -112,6 +108,12 @@ class ParserPreparation:
         self._libraries, self._capacity = (), LEAST_CAPACITY
         self._requests += 1
         self._since = None
+
+    def _supersede(self) -> None:
+        """A parser is made from now on; what the worker may be making is not wanted any more."""
+        self._requests += 1
+        self._since = time.monotonic()
+        self._parts.refusal = ""
 
     def _on_made(self) -> None:
         if (seconds := self.seconds) is None:

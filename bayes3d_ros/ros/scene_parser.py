@@ -84,12 +84,11 @@ class SceneParserNode(Node):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the library and compile, unless that has been done already."""
         try:
-            compiling = self._preparation.seconds is not None
-            if self._ready is None and compiling and self.get_parameter("autostart").value:
-                told = "configure is refused: the node compiles already, and configures itself then (autostart)"
-                self.get_logger().warning(told)
-                return TransitionCallbackReturn.FAILURE
             if self._ready is None:
+                if self._preparation.seconds is not None and self.get_parameter("autostart").value:
+                    told = "configure is refused: the node compiles already, and configures itself then (autostart)"
+                    self.get_logger().warning(told)
+                    return TransitionCallbackReturn.FAILURE
                 with self._parts.reporting():
                     self._preparation.make()
         except (ValueError, LibraryError) as error:

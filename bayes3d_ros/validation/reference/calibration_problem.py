@@ -190,9 +190,9 @@ def run_sampler(key: PRNGKeyArray, image: ScoredImage, problem: CalibrationProbl
             ess.append(float(info.ess))
         log_mass.append(float(state.log_evidence) + problem.log_count[number])
         if number and log_mass[-1] > max(log_mass) - NEGLIGIBLE:
-            refresh_key = jax.random.fold_in(key, 2000 + number)
+            moves_key = jax.random.fold_in(key, 2000 + number)
             state = smc.rejuvenated(
-                refresh_key,
+                moves_key,
                 state,
                 jnp.int32(number),
                 context,
