@@ -33,7 +33,7 @@ def evaluate(experiment: str, folder: Path | None, quick: bool, fresh: bool, out
     FOLDER is for real-scenes only: the recordings that it parses. Default: the folder BAYES3D_DATA, else
     ../shared/data.
 
-    docs/outputs.md says what each experiment measures. `bayes3d report` makes a page of each.
+    docs/evaluations.md says what each experiment measures. `bayes3d report` makes a page of each.
     """
     if folder is not None and experiment not in ON_FOLDER:
         raise InputError(f"{folder}: expected no FOLDER, {experiment} takes none ({', '.join(ON_FOLDER)} does)")

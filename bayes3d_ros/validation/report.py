@@ -57,7 +57,7 @@ def page(report: Report, about: str, wanted: Wanted, pictures: Sequence[str] = (
     parts += ["## Summary", *_summary_tables(report["summary"], wanted)]
     parts += [f"![{picture}]({RESULTS}/{picture})" for picture in pictures]
     parts.append(f"All rows: [{RESULTS}/{name}.json]({RESULTS}/{name}.json).")
-    parts.append("[outputs.md](../outputs.md) explains every number.")
+    parts.append("[evaluations.md](../evaluations.md) explains every number.")
     return "\n\n".join(parts) + "\n"
 
 
