@@ -7,7 +7,7 @@
 # make lint    ruff and mypy
 # make build   build the package into install/ with colcon, for ros2 run and ros2 launch
 # make colcon  build the package and run its tests with colcon;  COLCON_TESTS="test/geometry"  some of them
-# make clean   remove .venv and everything built
+# make clean   remove .venv and everything built; results in out/ stay
 #
 # PYTHON=/path/to/python3 chooses the Python; otherwise tools/find_python.sh does.
 
@@ -81,5 +81,5 @@ colcon: build
 	    --pytest-args $(COLCON_TESTS)
 
 clean:
-	rm -rf $(VENV) build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
