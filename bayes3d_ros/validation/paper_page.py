@@ -38,7 +38,7 @@ def _row(claim: Claim, reports: Mapping[str, Report]) -> tuple[str, ...]:
         return (*paper, "not measured" if report else "not run", "-", claim.criterion, "")
     if report.get("quick"):
         return (*paper, f"{answer.words} (quick)", "not decided", claim.criterion, "a quick run")
-    why = "" if answer.holds else claim.why_not.format(machine=_machine(report))
+    why = "" if answer.holds else answer.why_not or claim.why_not.format(machine=_machine(report))
     return (*paper, answer.words, "yes" if answer.holds else "**no**", claim.criterion, why)
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
 
 from bayes3d_ros.posterior.types import ParseError, SceneSamples
 from bayes3d_ros.validation.experiments import mug_pose
-from bayes3d_ros.validation.experiments.mug_pose import PARSER, KnownMug, Truth
+from bayes3d_ros.validation.experiments.mug_pose import PARSER, KnownMug, ParserStep, Truth
 from bayes3d_ros.validation.networks.von_mises import VonMises
 from bayes3d_ros.validation.reference.exact_yaw import entropy, every_yaw, yaw_axis, yaw_posterior
 from bayes3d_ros.validation.simulate.mug_images import (
@@ -26,7 +26,14 @@ from bayes3d_ros.validation.simulate.mug_images import (
 from bayes3d_ros.validation.simulate.random_scenes import REALSENSE
 from bayes3d_ros.validation.simulate.shared_error_frames import PlacedObject
 from bayes3d_ros.validation.simulate.small_images import clean_depth
-from bayes3d_ros.validation.statistics.yaw_samples import circular_sd, kernel_density, weighted_yaws, yaw_scores
+from bayes3d_ros.validation.statistics.model_sizes import ModelSizes
+from bayes3d_ros.validation.statistics.yaw_samples import (
+    WeightedYaws,
+    circular_sd,
+    kernel_density,
+    weighted_yaws,
+    yaw_scores,
+)
 
 YAWS = 90
 
@@ -99,11 +106,31 @@ def test_cross_entropy_is_least_of_the_posterior_itself():
 
 
 def test_the_density_of_samples_integrates_to_one_and_is_never_zero():
-    density = kernel_density(np.array([0.0, 3.0]), np.array([0.25, 0.75]))
+    yaws = np.concatenate([np.linspace(-0.01, 0.01, 5), np.linspace(2.99, 3.01, 5)])
+    density = kernel_density(WeightedYaws(yaws, np.repeat([0.05, 0.15], 5), np.arange(10)))
     axis = yaw_axis(3600)
     p = np.exp(density(axis)) * 2 * np.pi / len(axis)
     assert p.sum() == pytest.approx(1, abs=1e-9) and (p > 0).all()
     assert p[np.abs(axis - 3.0) < 0.3].sum() == pytest.approx(0.75 * 0.99 + 0.01 * 0.6 / (2 * np.pi), abs=1e-4)
+
+
+def test_the_kernel_is_as_wide_as_independent_samples_say():
+    """Of 400 normal yaws the density comes near the normal's own entropy; copies of one draw say nothing of each
+    other, and alone get the widest kernel."""
+    rng, even = np.random.default_rng(0), np.full(400, 1 / 400)
+    truth = np.radians(1.0) * rng.standard_normal(5000)
+    own_entropy = float(np.log(np.radians(1.0) * np.sqrt(2 * np.pi * np.e)))
+    samples = np.radians(1.0) * rng.standard_normal(400)
+    loss = -kernel_density(WeightedYaws(samples, even, np.arange(400)))(truth).mean()
+    assert own_entropy < loss < own_entropy + 0.05
+    copies = samples[np.repeat(np.arange(40), 10)] + 1e-5 * rng.standard_normal(400)
+    as_copies, as_samples = (
+        -kernel_density(WeightedYaws(copies, even, draw))(truth).mean()
+        for draw in (np.repeat(np.arange(40), 10), np.arange(400))
+    )
+    assert as_copies < own_entropy + 0.1 < as_samples
+    one = kernel_density(WeightedYaws(copies[:2], even[:2] * 200, np.zeros(2, int)))(np.array([copies[0]]))
+    assert np.exp(one[0]) == pytest.approx(0.99 / (np.radians(8.0) * np.sqrt(2 * np.pi)), rel=0.02)
 
 
 def samples_of(yaws, log_weight, T_table_camera):
@@ -123,9 +150,13 @@ def samples_of(yaws, log_weight, T_table_camera):
 
 def test_yaws_of_samples_are_those_in_the_tables_frame():
     view = mug_view(TRAINED, np.random.default_rng(0))
-    yaws, weights = weighted_yaws(samples_of([0.3, -2.0], np.log([0.2, 0.8]), view.T_table_camera), view.T_table_camera)
-    np.testing.assert_allclose(yaws, [0.3, -2.0])
-    np.testing.assert_allclose(weights, [0.2, 0.8])
+    samples = samples_of([0.3, -2.0], np.log([0.2, 0.8]), view.T_table_camera)
+    found = weighted_yaws(samples, view.T_table_camera)
+    np.testing.assert_allclose(found.yaw, [0.3, -2.0])
+    np.testing.assert_allclose(found.weight, [0.2, 0.8])
+    assert list(found.draw) == [0, 1]
+    drawn = weighted_yaws(samples._replace(draw=np.array([[7], [7]])), view.T_table_camera)
+    assert list(drawn.draw) == [7, 7]
 
 
 @pytest.fixture
@@ -143,18 +174,20 @@ def parser_rows(mug, clean):
             own = images.yaw[0] - turn + np.array([-0.05, 0.05])
             return SimpleNamespace(samples=samples_of(own, np.log([0.5, 0.5]), frame.T_table_camera))
 
-        known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, 2048)
-        return mug_pose._parser_rows(5, 0, lambda condition, group: truth, lambda views: known)
+        known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, ModelSizes((2048,), 32, 64))
+        step = ParserStep(5, mug_pose.INDEPENDENT)
+        return mug_pose._parser_rows(step, 0, lambda condition, group: truth, lambda step: known)
 
     return made
 
 
-def test_the_parsers_rows_score_its_samples(parser_rows, monkeypatch):
-    monkeypatch.setattr(mug_pose, "library_arrays", lambda library: [np.zeros(4)])
+def test_the_parsers_rows_score_its_samples(parser_rows):
     row, *others = parser_rows(False)
     resultant = float(np.cos(0.05))
     assert row["log_p_true"][0] == pytest.approx(0.5 * np.log(1 / (2 * (1 - resultant)) / (2 * np.pi)), abs=0.01)
-    assert row["samples_log_p_true"][0] > 0 and row["failed"] == 0 and row["memory_bytes"] == 32
+    assert row["samples_log_p_true"][0] > 0 and row["failed"] == 0
+    assert (row["file_bytes"], row["memory_bytes"], row["padded_memory_bytes"]) == (2048, 32, 64)
+    assert row["method"] == "Bayes3D (independent)" and row["training"] == 5
     assert [row["test"], *(o["test"] for o in others)] == list(MUG_CONDITIONS)
     lost = parser_rows(True)[0]
     assert lost["failed"] == 1 and lost["log_p_true"][0] == pytest.approx(-np.log(2 * np.pi), abs=1e-3)
@@ -166,23 +199,29 @@ def made_up(method, training, loss, test="as trained"):
     row |= {"entropy": [-3.0, 0.1], "best_von_mises": [-2.9, 0.2]}
     row |= {"sd": [1.0, 40.0], "exact_sd": [0.8, 30.0], "handle": [1.0, 0.0]}
     if method == PARSER:
-        row |= {"samples_cross_entropy": [0.0, 1.0], "samples_log_p_true": [0.0, 1.0]}
+        row |= {"samples_cross_entropy": [0.0, 1.0], "samples_log_p_true": [0.0, 1.0], "failed": 1}
+    else:
+        row |= {"rate": 1e-3, "steps": 0, "training_loss": 0.1, "validation_loss": 0.2}
     return row
 
 
 def test_summary_lines_and_picture(tmp_path):
     rows = [made_up("network 1 M", 10, 1.5), made_up("network 1 M", 100, 0.2), made_up(PARSER, 1, 0.9)]
-    rows += [made_up(PARSER, 10, 0.3), made_up(PARSER, 10, 0.4), made_up(PARSER, 0, -1.0)]
+    rows += [made_up(PARSER, 5, 0.3), made_up(PARSER, 10, 0.3), made_up(PARSER, 10, 0.4), made_up(PARSER, 0, -1.0)]
     told = mug_pose.summary(rows)
     assert told["network_needs"] == {"as trained": 100}
-    assert told["as trained: Bayes3D 10"]["cross_entropy"] == 0.85 and told["as trained: Bayes3D 10"]["images"] == 4
+    ten = told["as trained: Bayes3D 10"]
+    assert (ten["cross_entropy"], ten["in_sight"], ten["hidden"]) == (0.85, 0.35, 1.35)
+    assert (ten["images"], ten["failed"]) == (4, 2) and "less_ours" not in ten
+    assert told["as trained: network 1 M 10"]["less_ours"] == pytest.approx([1.2, 1.2, 1.2])
+    assert told["trained: network 1 M 100"]["rate"] == 1e-3
     assert told["as trained: exact"] == {"entropy": -1.45, "best_von_mises": -1.35}
     assert told["Bayes3D: size"]["file_bytes"] == 11_000
     rows[1] = made_up("network 1 M", 100, 2.0)
     assert mug_pose.summary(rows)["network_needs"] == {"as trained": None}
     paths = mug_pose.plot(rows, tmp_path)
     assert [path.suffix for path in paths] == [".pdf", ".png"] * 2 and all(path.stat().st_size > 1000 for path in paths)
-    rows[0] |= {"looks": [[50, 1.0, 1.1], [100, 0.8, 0.9]], "steps": 100, "validation_loss": 0.9}
+    rows[0] |= {"looks": [[50, 1.0, 1.1], [100, 0.8, 0.9]], "steps": 100}
     names = [path.name for path in mug_pose.plot(rows, tmp_path)]
     assert names[4:] == ["mug-pose-training.pdf", "mug-pose-training.png"]
     assert "mesh" in mug_pose.line(rows[-1]) and mug_pose.plot([], tmp_path) == []

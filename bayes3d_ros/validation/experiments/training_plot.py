@@ -53,7 +53,7 @@ def _curves(axis: Axes, row: Row, tint: str) -> None:
     axis.plot(steps, training, "--", color=tint, linewidth=1)
     axis.plot(steps, validation, color=tint, linewidth=1.3, label=f"{row['training']:,} images")
     if row["steps"] > 0:
-        axis.plot(row["steps"], row["validation_loss"], "o", color=tint, markersize=4)
+        axis.plot(row["steps"], validation[steps == row["steps"]][0], "o", color=tint, markersize=4)
     axis.set_xscale("log")
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

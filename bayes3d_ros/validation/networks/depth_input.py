@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Depth images as networks get them: the same pixels that the parser scores."""
+"""Depth images as networks get them: every return. The parser is given the same image and leaves out returns of its own
+accord (docs/decisions/002-pixel-mask.md)."""
 
 from typing import NamedTuple
 

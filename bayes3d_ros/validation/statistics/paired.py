@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether one of two methods is right more often than the other on the same cases."""
+"""Whether one of two methods is better than the other on the same cases."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from scipy.stats import binomtest
+
+_RESAMPLED = 2000
 
 
 class PairedTest(NamedTuple):
@@ -26,3 +28,23 @@ def mcnemar(first: Bool[np.ndarray, "N"], second: Bool[np.ndarray, "N"]) -> Pair
         return PairedTest(0, 0, 1.0, 1.0)
     worse, better = (binomtest(only_first, differ, alternative=side).pvalue for side in ("less", "greater"))
     return PairedTest(only_first, only_second, float(worse), float(better))
+
+
+class Difference(NamedTuple):
+    """A mean, and its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def mean_difference(
+    first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"], group: Int[np.ndarray, "N"]
+) -> Difference:
+    """Of first less second. The interval is of a bootstrap over groups of cases (numbered from 0), as cases of a group
+    are alike."""
+    apart, size = np.bincount(group, first - second), np.bincount(group)
+    drawn = np.random.default_rng(0).integers(len(size), size=(_RESAMPLED, len(size)))
+    means = apart[drawn].sum(1) / size[drawn].sum(1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return Difference(float(apart.sum() / size.sum()), float(low), float(high))

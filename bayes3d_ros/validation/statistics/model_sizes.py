@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""How much there is to keep of a library: files, and arrays in memory."""
+
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.objects.model import Library
+from bayes3d_ros.objects.store import save_model
+
+
+class ModelSizes(NamedTuple):
+    """Bytes."""
+
+    files: tuple[int, ...]  # one a model
+    memory: int  # arrays that scenes are rendered and searched with, of the library's own types and voxels
+    padded_memory: int  # the same as they are allocated: sizes are padded so that a library may grow
+
+
+def model_sizes(library: Library) -> ModelSizes:
+    """The sizes of a library's models."""
+    with tempfile.TemporaryDirectory(prefix="bayes3d-model-sizes-") as folder:
+        files = tuple(save_model(model, Path(folder)).stat().st_size for model in library.models)
+    arrays = library_arrays(library)
+    return ModelSizes(files, _own_bytes(arrays), sum(array.nbytes for array in arrays))
+
+
+def _own_bytes(arrays: LibraryArrays) -> int:
+    own, padded = int(arrays.num_types), len(arrays.first)
+    voxels = 8 * int(np.prod(np.asarray(arrays.dims[:own], np.int64), axis=1).sum())  # a grid for each octant
+    types = [array for name, array in arrays._asdict().items() if name != "words" and array.ndim]
+    return voxels * arrays.words.dtype.itemsize + sum(array.nbytes * own // padded for array in types)
