@@ -176,6 +176,7 @@ def parser_rows(mug, clean):
 
         known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, ModelSizes((2048,), 32, 64))
         step = ParserStep(5, mug_pose.INDEPENDENT)
+        assert [ParserStep(1).method, ParserStep(5, voxel_size=0.002).method] == [PARSER, "Bayes3D (2 mm)"]
         return mug_pose._parser_rows(step, 0, lambda condition, group: truth, lambda step: known)
 
     return made

@@ -82,7 +82,6 @@ def notes(quick: bool) -> list[str]:
         f"a probability below {LEAST_PROBABILITY:g} counts as that in log losses",
         "networks get the depth of every return, scaled, and a channel that is 1 where there is no return; the parser "
         "leaves out returns that its mask leaves out (decision 2)",
-        "noise was chosen so that the parser's table step accepts the images: with 2 % outliers it refuses some",
         f"models have voxels of {1000 * VOXEL:g} mm",
         *(left_out if quick else []),
     ]
