@@ -37,6 +37,8 @@ _LEAST_SIGMA, _LEAST_TABLE = 1e-4, 2e-5  # metres
 _FEWEST_CELLS = 10
 _NO_INLIERS = 1e-6  # returns: with fewer inliers than that, they say nothing of sigma
 _STEPS = 12
+_LEAST_SD = 1e-9  # where both nodes of sigma stand at the end of its prior
+_MOST_NORMAL = 5.0  # a normal density that is cut there is the whole one
 _MOST_SDS = 3.0  # most by which a scene's noise moves away from what the table says
 _WIDEST = np.array([0.6, 1.0, 0.6])  # standard deviations if the table says nothing
 
@@ -207,15 +209,26 @@ def _grown(which: Bool[np.ndarray, "H W"], by: int) -> Bool[np.ndarray, "H W"]:
     return ndimage.maximum_filter(which, 2 * by + 1, mode="constant", cval=False)
 
 
-def sample_noise_at(key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S T"]) -> Noise:
+def sample_noise_at(
+    key: PRNGKeyArray, nodes: ErrorNodes, loglik_grid: Float[Array, "N S T"], sigma_max: float
+) -> Noise:
     """sigma and p_outlier of each scene given the image: drawn from the table's normal density, moved by what the
-    scene's own likelihood at the four pairs of nodes adds to the table's."""
+    scene's own likelihood at the four pairs of nodes adds to the table's, and cut at sigma_max, metres."""
     log_mass = jax.nn.logsumexp(loglik_grid + nodes.log_weight, -1).reshape(-1, 2, 2)
     of_sigma, of_p = (jax.nn.logsumexp(log_mass, axis) for axis in (2, 1))
     moved = jnp.stack([0.5 * (a[:, 1] - a[:, 0]) for a in (of_sigma, of_p)], -1)
-    normal = jnp.clip(moved, -_MOST_SDS, _MOST_SDS) + jax.random.normal(key, moved.shape)
     lowest, highest = (
         jnp.stack([jnp.log(nodes.sigma[pair]), jax.scipy.special.logit(nodes.p_outlier[pair])]) for pair in (0, 3)
     )
-    log_sigma, logit_p = ((lowest + highest) / 2 + (highest - lowest) / 2 * normal).T
-    return Noise(jnp.exp(log_sigma), jax.nn.sigmoid(logit_p))
+    sd = (highest - lowest) / 2
+    mean = (lowest + highest) / 2 + sd * jnp.clip(moved, -_MOST_SDS, _MOST_SDS)
+    normal = jax.random.normal(key, moved.shape)
+    most = (jnp.log(sigma_max) - mean[:, 0]) / jnp.maximum(sd[0], _LEAST_SD)
+    log_sigma = mean[:, 0] + sd[0] * _below(most, normal[:, 0])
+    return Noise(jnp.exp(log_sigma), jax.nn.sigmoid(mean[:, 1] + sd[1] * normal[:, 1]))
+
+
+def _below(most: Float[Array, "N"], normal: Float[Array, "N"]) -> Float[Array, "N"]:
+    """Standard normal numbers as numbers of the density that is cut at `most`, by its inverse distribution."""
+    cut = jax.scipy.special.ndtri(jax.scipy.special.ndtr(normal) * jax.scipy.special.ndtr(most))
+    return jnp.where(most > _MOST_NORMAL, normal, cut)

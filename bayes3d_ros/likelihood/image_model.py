@@ -131,8 +131,8 @@ def likeliest_noise(model: ImageModel, loglik_grid: Float[Array, "S P"]) -> Nois
     return Noise(sigma[None], jnp.maximum(nodes.p_outlier[best], _LEAST_P)[None])
 
 
-def sample_noise(key: PRNGKeyArray, model: ImageModel, loglik_grid: Float[Array, "N S P"]) -> Noise:
-    """sigma and p_outlier of each scene, given the image."""
+def sample_noise(key: PRNGKeyArray, model: ImageModel, loglik_grid: Float[Array, "N S P"], sigma_max: float) -> Noise:
+    """sigma and p_outlier of each scene, given the image. sigma_max: metres, the end of sigma's prior."""
     if isinstance(model, NoiseGrid):
         return noise_marginal.sample(key, loglik_grid, model)
-    return sample_noise_at(key, model.image.nodes, loglik_grid)
+    return sample_noise_at(key, model.image.nodes, loglik_grid, sigma_max)

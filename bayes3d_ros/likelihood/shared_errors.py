@@ -22,11 +22,11 @@ these are good, so that the product over cells is a density whatever it approxim
 
 A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is that given the cells: the
 mixture of `density.py` about the objects' surfaces d + phi . a_object, with a_object at the mode that the object's
-cells give it at the node in the middle, where the scale is 1. Each point of the mixture is as wide as its surface's
-errors make it (an object's: bias, w and b, their scale at most `WIDEST_EDGES`) and as likely as a blur of the image
-says (outlines of depth images are off by a part of a pixel, and alike along an object). A share of the density is for
-returns between the window's front and back, and, with probability pi, for returns up to `BAD_DEPTH` in front of an
-object.
+cells give it with scale 1 and, of the four pairs of noise, the one with the larger sigma and the smaller p_out. Each
+point of the mixture is as wide as its surface's errors make it (an object's: bias, w and b, their scale at most
+`WIDEST_EDGES`) and as likely as a blur of the image says (outlines of depth images are off by a part of a pixel, and
+alike along an object). A share of the density is for returns between the window's front and back, and, with probability
+pi, for returns up to `BAD_DEPTH` in front of an object.
 
 Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
 behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else
@@ -63,9 +63,8 @@ SEAM_DEPTH = 0.01  # metres between neighbouring returns over which depth goes o
 TABLE_MARGIN = 0.008  # metres in front of the table from which a return belongs to something else, or
 TABLE_MARGIN_SDS = 5.0  # so many standard deviations of a return
 STEEPEST = 3.0  # metres of depth a metre across: a window that is steeper shows several surfaces
-WIDEST_EDGES = (
-    1.0  # scale of errors up to which edges are wider with it: a wrong type has large ones, and must fit outlines
-)
+# Scale of errors up to which edges are wider with it: a wrong type has large ones, and must fit outlines.
+WIDEST_EDGES = 1.0
 LOST_SHARE, LOST_DEPTH = 0.5, 0.3  # of `edge_share`; metres over which such returns are spread
 BLOCK_SIDE = 0.015  # metres at the reference depth: the table's median in the image
 LEAST_BLOCK = 2  # pixels

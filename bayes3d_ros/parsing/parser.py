@@ -6,6 +6,7 @@ import contextlib
 import copy
 import time
 from dataclasses import fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -36,6 +37,9 @@ from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import PER_FRAME, ParserSettings
 
+# Folded into a frame's key for what is sampled of each number of objects, and for each run of the sampler.
+_KEPT, _RUNS_APART = 1000, 10_000
+
 
 class SceneParser:
     """Holds a library and compiled code; keeps no state between frames.
@@ -59,8 +63,7 @@ class SceneParser:
         self._arrays = _of_types(library_arrays(library), library, settings.types)
         self._footprints = Footprints(library)
         self._grid = noise_marginal.noise_grid(settings.sigma_max)
-        self._table_size = (settings.table_width, settings.table_depth)
-        self._sample_noise = jax.jit(sample_noise)
+        self._sample_noise = jax.jit(partial(sample_noise, sigma_max=settings.sigma_max))
         self._gauss = jax.jit(_errors_of_samples, static_argnums=1)
         self._compiled: set[tuple[int, ...]] = set()  # shapes of the arrays that images are scored in
 
@@ -176,15 +179,15 @@ class SceneParser:
         stages = [
             pooled([Stage.without_scenes(float(s.log_evidence), slots) for s in each], len(runs)) for each in states
         ]
-        log_mass = [stage.log_evidence + n * np.log(settings.count_ratio) for n, stage in enumerate(stages)]
+        log_mass = [stage.log_evidence + n * np.log(settings.known_ratio) for n, stage in enumerate(stages)]
         only_last = settings.fixed_objects >= 0 and not settings.knows_unknown
         best = -np.inf
         for count in [len(states) - 1] if only_last else np.argsort(-np.array(log_mass), kind="stable").tolist():
             if log_mass[count] > best + LEAST_LOG_WEIGHT:
-                keys = [jax.random.fold_in(key, 1000 * (r + 1) + count) for r in range(len(states[count]))]
+                keys = [jax.random.fold_in(key, _KEPT + _RUNS_APART * r + count) for r in range(len(states[count]))]
                 kept = [self._keep(k, state, count, model, seen) for k, state in zip(keys, states[count], strict=True)]
                 stages[count] = pooled(kept, len(runs))
-                best = max(best, stages[count].log_evidence + count * np.log(settings.count_ratio))
+                best = max(best, stages[count].log_evidence + count * np.log(settings.known_ratio))
         return stages
 
     def _keep(
@@ -194,8 +197,14 @@ class SceneParser:
         slots = max(self.settings.max_objects, 1)  # those beyond are empty
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
-        objects, gauss, off, log_weight, noise, log_evidence, lineage = jax.device_get(
-            (state.objects, gauss, state.warp[..., -1], state.log_weight, noise, state.log_evidence, state.lineage)
+        of_things = jax.random.key_data(jax.random.fold_in(key, 3))
+        (objects, off, log_weight, log_evidence, lineage), gauss, noise, of_things = jax.device_get(
+            (
+                (state.objects, state.warp[..., -1], state.log_weight, state.log_evidence, state.lineage),
+                gauss,
+                noise,
+                of_things,
+            )
         )
         objects, off, lineage = jax.tree.map(lambda a: a[:, :slots], (objects, off, lineage))
         gauss = gauss[:, : slots + 2]
@@ -203,9 +212,13 @@ class SceneParser:
         stage = Stage(
             objects, gauss, off, log_weight, noise.p_outlier, noise.sigma, float(log_evidence), things, lineage
         )
-        return self._with_things(stage, state.scenes, count, seen) if seen and self.settings.knows_unknown else stage
+        if seen is None or not self.settings.knows_unknown:
+            return stage
+        return self._with_things(np.random.default_rng(of_things), stage, state.scenes, count, seen)
 
-    def _with_things(self, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation) -> Stage:
+    def _with_things(
+        self, rng: np.random.Generator, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation
+    ) -> Stage:
         """The stage's scenes with unknown things added."""
         settings = self.settings
         half = settings.window // 2
@@ -213,10 +226,10 @@ class SceneParser:
         found = find_things(
             np.asarray(scenes)[:, half:, half:],
             seen,
-            float(np.log(settings.count_ratio * settings.unknown_probability)),
+            float(np.log(settings.unknown_ratio)),
             (settings.fixed_objects if fixed else settings.max_objects) - count,
             fixed,
-            settings.seed,
+            rng,
             KnownObjects(stage.objects, self._footprints),
         )
         log_weight = stage.log_weight + found.log_weight
@@ -233,8 +246,7 @@ class SceneParser:
         """The mixture over the number of known objects, log p(image) - log p(image | empty), and the unknown
         things of each sample."""
         settings = self.settings
-        known = np.log1p(-settings.unknown_probability) if settings.knows_unknown else 0.0
-        log_prior = np.arange(len(stages)) * (np.log(settings.count_ratio) + known)
+        log_prior = np.arange(len(stages)) * np.log(settings.known_ratio)
         if settings.fixed_objects < 0:
             log_prior -= np.logaddexp.reduce(np.arange(settings.max_objects + 1) * np.log(settings.count_ratio))
         else:

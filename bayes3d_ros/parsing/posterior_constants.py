@@ -15,7 +15,7 @@ LEAST_LIKELY_COUNT = math.log(0.15)
 # left out (`sampler_runs.py`).
 MISSED_NATS = 7.0
 
-LEAST_THING = 4e-4  # metres^2, as the camera sees it: smaller unknown regions are outliers
+LEAST_THING = 4e-4  # metres^2, as the camera sees it: smaller unknown regions are no things
 ON_OBJECT = 0.01  # probability that an unknown thing stands on a known object, or in it, and not on the table
 ON_OBJECT_SHARE = 0.25  # of its returns over known objects, above which it does: edges of things that touch are blurred
 THINGS_APART = 0.02  # metres between returns of two unknown things: nearer, they are one

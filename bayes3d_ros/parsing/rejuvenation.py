@@ -28,7 +28,7 @@ from bayes3d_ros.parsing.search import conflicts
 from bayes3d_ros.parsing.tuning import SAMPLER
 from bayes3d_ros.sampling.resampling import distinct_fraction, normalised, resample
 
-_ORDER_CLEAR_NATS = 60.0  # nats between the objects' own gains, beyond which a move cannot change which one came last
+_ORDER_CLEAR_NATS = 60.0  # nats between the objects' own gains: beyond, a move is taken not to change which came last
 
 
 class WeightedScenes(NamedTuple):

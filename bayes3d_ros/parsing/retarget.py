@@ -17,14 +17,13 @@ from bayes3d_ros.sampling.resampling import normalised
 
 @partial(jax.jit, static_argnames="window")
 def retargeted(
-    state: Population, count: Int[Array, ""], context: Context, model: ImageModel, other: ImageModel, window: int
+    state: Population, count: Int[Array, ""], context: Context, other: ImageModel, window: int
 ) -> Population:
-    """Scenes of `count` objects weighted under `model`, weighted under `other` instead: all that a model says of a
-    scene is that of the other one, and the weights change by the ratio of the targets over ordered lists, p_k times the
-    backward kernels."""
+    """Scenes of `count` objects that are weighted under one model, weighted under `other` instead: all that a model
+    says of a scene is that of the other one, and the weights change by the ratio of the targets over ordered lists, p_k
+    times the backward kernels."""
     particles = jnp.arange(len(state.log_weight))
     empty = empty_table(context, other, window)
-    before = log_marginal(model, state.empty.loglik_grid)
 
     def with_next(m: Array, carry: tuple) -> tuple:
         scenes, grid, solo_gain, warp = carry
@@ -39,7 +38,7 @@ def retargeted(
     start = bare, grid, state.solo_gain, state.warp
     scenes, grid, solo_gain, warp = jax.lax.fori_loop(0, count, with_next, start)
     log_likelihood = log_marginal(other, grid)
-    gained = (log_likelihood - empty.log_likelihood) - (state.log_likelihood - before)
+    gained = (log_likelihood - empty.log_likelihood) - (state.log_likelihood - state.empty.log_likelihood)
     gained += log_order(solo_gain, count) - log_order(state.solo_gain, count)
     log_weight, total = normalised(state.log_weight + gained)
     return state._replace(

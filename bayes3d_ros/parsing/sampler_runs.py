@@ -130,7 +130,7 @@ def _run(key: PRNGKeyArray, frame: _Frame, guide: ImageModel | None) -> SamplerR
         )
         states.append(_under_model(ahead, count + 1, frame, guide))
         ess.append(float(info.ess))
-        log_mass.append(float(states[-1].log_evidence) + (count + 1) * np.log(settings.count_ratio))
+        log_mass.append(float(states[-1].log_evidence) + (count + 1) * np.log(settings.known_ratio))
         if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + frame.least_likely):
             break
     return SamplerRun(states, log_mass, ess)
@@ -139,7 +139,7 @@ def _run(key: PRNGKeyArray, frame: _Frame, guide: ImageModel | None) -> SamplerR
 def _under_model(ahead: smc.Population, count: int, frame: _Frame, guide: ImageModel | None) -> smc.Population:
     if guide is None:
         return ahead
-    return retargeted(ahead, jnp.int32(count), frame.context, guide, frame.model, frame.settings.window)
+    return retargeted(ahead, jnp.int32(count), frame.context, frame.model, frame.settings.window)
 
 
 def _peaks_moved(key: PRNGKeyArray, run: SamplerRun, frame: _Frame) -> SamplerRun:

@@ -27,9 +27,8 @@ class Stage(NamedTuple):
     """What is kept of the scenes of k objects."""
 
     objects: Placement
-    gauss: Float[
-        np.ndarray, "N M2 3"
-    ]  # standard normal: for the table's two tilts and height, its bias, then for each object's picture
+    # Standard normal: for the table's two tilts and height, its bias, then for each object's picture.
+    gauss: Float[np.ndarray, "N M2 3"]
     off: Float[np.ndarray, "N M"]  # metres that the returns of each object lie behind it, against the table's
     log_weight: Float[np.ndarray, "N"]
     p_outlier: Float[np.ndarray, "N"]

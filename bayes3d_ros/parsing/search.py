@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.likelihood.density import IN_WORKSPACE, Noise
 from bayes3d_ros.likelihood.image_model import ImageModel, gain, likeliest_noise, log_marginal
@@ -69,15 +69,14 @@ def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, no
     """Which returns the scene explains.
 
     Returns in the workspace that stand in front of the scene by more than noise are unexplained. Returns that the
-    scene explains, and returns beyond the workspace, are witnesses of free space. A return far behind the scene is
-    an outlier whatever is added, and no witness. Where most returns are outliers, their consensus takes their
-    place.
+    scene explains, and returns beyond the workspace or that the mask left out, are witnesses of free space. A return
+    far behind the scene is an outlier whatever is added, and no witness. Where most returns are outliers, their
+    consensus takes their place.
     """
     many = noise.p_outlier[0] > SEARCH.many_outliers
     depth, pixel_class = jax.lax.cond(many, neighbour_depth, lambda *as_it_is: as_it_is, image.depth, image.pixel_class)
-    if (
-        image.rows is not None
-    ):  # rows below the camera's last one have no returns; those above would lend them a consensus
+    # Rows below the camera's last one have no returns; those above would lend them a consensus.
+    if image.rows is not None:
         depth = jnp.where(jnp.arange(len(depth))[:, None] < image.rows, depth, 0.0)
     in_front = scene_depth - depth
     # Where returns err by centimetres, three standard deviations would take a whole object for explained.
@@ -87,7 +86,9 @@ def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, no
     return UnexplainedReturns(depth, jnp.where(inside, unexplained, 0.0), jnp.where(inside, explained, 1.0))
 
 
-def conflicts(placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float):
+def conflicts(
+    placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float
+) -> Bool[Array, "N"]:
     """Whether an object interpenetrates any of the first `count` others by more than `limit`; placement [N], others
     [N, M]."""
 

@@ -38,6 +38,8 @@ from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
 from bayes3d_ros.sampling.resampling import effective_fraction, normalised, resample, systematic
 from bayes3d_ros.sampling.tempering import longest_step
 
+_TIE = 1e-3  # of the log likelihood: of scenes of about equal weight, as after resampling, the likeliest one leads
+
 
 class Population(NamedTuple):
     """N weighted scenes of k objects."""
@@ -114,7 +116,7 @@ def step(
     resample_key, search_key, draw_key, anneal_key = jax.random.split(key, 4)
     ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
-    scene = _lead(state, ancestor[jnp.argmax(log_weight + 1e-3 * state.log_likelihood[ancestor])], count)
+    scene = _heaviest(state, ancestor, log_weight, count)
     proposal, exponents = find_proposal(search_key, scene, context, model, table_size, window, OVERLAP_LIMIT)
 
     def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
@@ -171,7 +173,11 @@ def _own_gain(
     )
 
 
-def _lead(state: Population, lead: Int[Array, ""], count: Int[Array, ""]) -> LeadScene:
+def _heaviest(
+    state: Population, ancestor: Int[Array, "N"], log_weight: Float[Array, "N"], count: Int[Array, ""]
+) -> LeadScene:
+    """The scene whose copies are heaviest."""
+    lead = ancestor[jnp.argmax(log_weight + _TIE * state.log_likelihood[ancestor])]
     return LeadScene(state.scenes[lead], state.loglik_grid[lead], jax.tree.map(lambda a: a[lead], state.objects), count)
 
 

@@ -27,7 +27,8 @@ _ROUNDING = 1e-9  # metres: whole columns of pixels lie on a side of the table's
 
 
 class Plane(NamedTuple):
-    """Points x of the plane satisfy normal . x = distance in the camera frame; the normal points to the origin."""
+    """Points x of the plane satisfy normal . x = distance in the camera frame; the normal points to the origin.
+    Metres."""
 
     normal: Float[np.ndarray, "3"]
     distance: float
@@ -38,7 +39,8 @@ def _tolerance(z: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
 
 
 def find_plane(points: Float[np.ndarray, "N 3"], seed: int = 0) -> Plane:
-    """The dominant plane (sample consensus with a truncated quadratic loss, then least squares on the inliers).
+    """The dominant plane of points in the camera's frame, metres (sample consensus with a truncated quadratic loss,
+    then least squares on the inliers).
 
     Returns clearly below a plane count against it, mildly: a table hides what is under it, save beyond its edge.
     Raises ParseError where no plane holds a tenth of the returns.
@@ -65,7 +67,8 @@ def find_plane(points: Float[np.ndarray, "N 3"], seed: int = 0) -> Plane:
 
 
 def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5) -> Plane:
-    """Weighted least squares with range noise growing as z^2 and a robust (Geman-McClure) loss."""
+    """The plane near the given one that points in the camera's frame, metres, show: weighted least squares with range
+    noise growing as z^2 and a robust (Geman-McClure) loss. Raises ParseError where few points lie on it."""
     normal, distance = plane
     for k in range(rounds):
         height = points @ normal - distance
@@ -87,7 +90,8 @@ def refine_plane(points: Float[np.ndarray, "N 3"], plane: Plane, rounds: int = 5
 
 
 def table_frame(plane: Plane, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "4 4"]:
-    """T_camera_table: z along the normal, x to the camera's right, origin where the optical axis meets the table.
+    """T_camera_table, metres: z along the normal, x to the camera's right, origin where the optical axis meets the
+    table. points: of the camera's frame.
 
     If the axis misses the table, or meets it far behind what is seen, the origin is the middle of what is seen.
     """
@@ -182,7 +186,7 @@ def connected_pieces(
     risen: Bool[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"]
 ) -> tuple[Int[np.ndarray, "H W"], int]:
     """Pieces of a part of an image that are connected without a jump in depth: labels from 1 on, and their number."""
-    # Two labels a pixel would need a graph; cutting at jumps by dropping the farther pixel is enough here.
+    # Two labels a pixel would need a graph; dropping the pixel right of a jump, or below it, is enough here.
     with np.errstate(invalid="ignore"):
         cut = np.zeros(risen.shape, bool)
         for axis in (0, 1):

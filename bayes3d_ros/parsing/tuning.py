@@ -26,9 +26,8 @@ class SearchTuning(NamedTuple):
     coarse_penalty: float = 0.5  # of a sample that the camera sees past; one that matches gains 1; not recorded
     coarse_points: int = 36  # surface samples of a type; not recorded
     gathered: int = 3  # cells either way over which the returns about a cell are counted; not recorded
-    fewest_unexplained: int = (
-        8  # pixels of unexplained returns in these cells from which they are searched; not recorded
-    )
+    # Pixels of unexplained returns in these cells from which they are searched; not recorded.
+    fewest_unexplained: int = 8
     # Metres in front of the scene that noise explains at most; three times the default `sigma_max`. Chosen on seed 0 of
     # `noise-ablation`: at a sigma of 24 mm 53 % of 19 types were right without it, 89 % with it.
     widest_noise: float = 0.015
@@ -57,9 +56,8 @@ class SearchTuning(NamedTuple):
     turns_kept: int = 2
     turned_rounds: int = 3  # in which these are followed by a model of shared errors
     starts_apart: tuple[float, float] = (0.004, 0.05)  # m, rad: as candidates_apart; not recorded
-    repeated_nats: float = (
-        4.0  # subtracted for each better pose of the type at a place; mug or cup, two bricks (exactness)
-    )
+    # Subtracted for each better pose of the type at a place; mug or cup, two bricks (exactness).
+    repeated_nats: float = 4.0
     least_sigma: float = 0.002  # metres: with less, candidates one pixel off the peak score as misses; not recorded
     worth_nats: float = 5.0  # gain of the best candidate below which nothing is searched; not recorded
     # Factor on a pixel's log likelihood where the search scores pixels as if they erred independently: about ten share
@@ -99,9 +97,8 @@ class SearchTuning(NamedTuple):
     # Pilots are drawn wider than the mixture (smallest ESS over six frames and six seeds 0.004 before, 0.13 after,
     # together with LATERAL): too narrow a component cannot see that it is.
     pilot_scale: float = 1.5
-    trust_modes: float = (
-        0.5  # exponent on the masses of a type's modes, as pilots estimate them; mug or cup, two bricks (exactness)
-    )
+    # Exponent on the masses of a type's modes, as pilots estimate them; mug or cup, two bricks (exactness).
+    trust_modes: float = 0.5
     trust_types: float = 0.3  # exponent on the masses of types; likewise
     smallest_spread: tuple[float, float, float] = (2e-5, 2e-5, 2e-4)  # m, m, rad, of a mode; not recorded
     largest_spread: tuple[float, float, float] = (0.05, 0.05, 2.0)  # m, m, rad; not recorded

@@ -3,7 +3,7 @@
 """Unknown things, of no type in the library, in scenes of known objects.
 
 The likelihood scores returns in front of a scene as those of something unknown (`likelihood/shared_errors.py`). Each
-connected region of such returns is a thing, or outliers, with
+connected region of such returns, `LEAST_THING` large or larger, is a thing, or outliers, with
 
     log odds = sum over its returns of (log of the unknown surface's density - log of outliers') - outline's nats
                + log(count_ratio P(unknown)) + log P(what it stands on),
@@ -12,6 +12,8 @@ where the second line is the prior of one more thing, and of what it stands on: 
 (`stacking.py`). A thing is described by a box: upright, about its visible part, on the table. How far the box extends
 behind is uniform between the visible depth and the larger of the visible sides. Its other ends lie anywhere between the
 outermost returns and the next ones, which are not the thing's.
+
+A smaller region is neither: its returns keep the density of an unknown surface, and there is no thing.
 
 Where the prior has a region, a thing whose middle lies outside is neither reported nor counted; its returns stay what
 they are to any scene: those of such a thing, or outliers.
@@ -54,9 +56,8 @@ class UnknownThing(NamedTuple):
     size: Float[np.ndarray, "3"]  # of the visible part: along the box's x and y, and height
     centre: Float[np.ndarray, "2"]
     yaw: float
-    behind: Float[
-        np.ndarray, "3"
-    ]  # side along which it may go on (0 x, 1 y), towards which end (-1, 1), how far at most
+    # The side along which it may go on (0 x, 1 y), towards which end (-1, 1), how far at most.
+    behind: Float[np.ndarray, "3"]
     pixel: float  # metres between neighbouring returns, across the view
     floor: Float[np.ndarray, "P 2"]  # places on the table below some of the returns
 
@@ -81,13 +82,12 @@ def find_things(
     log_prior: float,
     room: int,
     exactly: bool,
-    seed: int,
+    rng: np.random.Generator,
     known: KnownObjects | None = None,
 ) -> ThingsOfScenes:
     """Sample the unknown things of each scene. scenes: depth as the camera shows it; log_prior: of one more thing;
     room: how many things a scene may hold, at most or (exactly) exactly: then those with the best odds; known: what
     else the scenes hold. A thing whose middle lies outside the region is not counted."""
-    rng = np.random.default_rng(seed)
     part = before_the_table(seen)
     found: dict[bytes, tuple[UnknownThing, ...]] = {}
     held, log_weight = [], np.zeros(len(scenes))
@@ -97,8 +97,9 @@ def find_things(
         if key not in found:
             found[key] = _things(mask, seen)
         here: list[UnknownThing] = []
-        for thing in sorted(found[key], key=lambda thing: -thing.log_gain):
-            odds, full = thing.log_gain + log_prior + _log_support(thing, n, known), len(here) >= room
+        with_odds = [(thing.log_gain + log_prior + _log_support(thing, n, known), thing) for thing in found[key]]
+        for odds, thing in sorted(with_odds, key=lambda pair: -pair[0]):
+            full = len(here) >= room
             if not in_region(thing.centre[0], thing.centre[1], seen.table):
                 log_weight[n] += float(np.logaddexp(odds, 0.0)) - thing.log_gain
                 continue

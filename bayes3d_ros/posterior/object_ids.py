@@ -27,7 +27,7 @@ class NamedObject(NamedTuple):
 
 
 class IdMemory(NamedTuple):
-    """Objects that have an id, in the order of their ids, all in one frame; and how many ids each type has had."""
+    """Objects that have an id, sorted by their ids as text, all in one frame; and how many ids each type has had."""
 
     frame_id: str = ""
     objects: tuple[NamedObject, ...] = ()

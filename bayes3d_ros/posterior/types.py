@@ -153,9 +153,8 @@ class ScenePosterior:
     # Returns from the unknown things of the best scene: x y z in the camera, metres, and which of `objects` they show.
     unknown_points: Float[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     unknown_object: Int[np.ndarray, "P"] = field(default_factory=lambda: np.zeros(0, np.int32))
-    table_found: bool = (
-        False  # in the image alone: then its frame differs from image to image, and belongs to no camera pose
-    )
+    # In the image alone: then its frame differs from image to image, and belongs to no camera pose.
+    table_found: bool = False
     told_in: OutputFrame | None = None  # the frame of the poses; None: the camera's
 
     @property

@@ -30,7 +30,7 @@ def log_density(
     log_determinant: Float[Array, "*n"] | float = 0.0,
 ) -> Float[Array, "*n"]:
     """log density, given the squared distance from the centre in units of the scale, and the log determinant of the
-    scale (1 for a standard t)."""
+    scale (0 for a standard t)."""
     log_norm = (
         jax.scipy.special.gammaln((freedom + dimensions) / 2)
         - jax.scipy.special.gammaln(freedom / 2)

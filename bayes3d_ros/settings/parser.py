@@ -264,6 +264,16 @@ class ParserSettings:
         return self.unknown and self.shares_errors
 
     @property
+    def known_ratio(self) -> float:
+        """Prior odds of one known object more: P(n + 1) / P(n), and that it is of a type in the library."""
+        return self.count_ratio * (1 - self.unknown_probability if self.knows_unknown else 1.0)
+
+    @property
+    def unknown_ratio(self) -> float:
+        """Prior odds of one unknown thing more."""
+        return self.count_ratio * self.unknown_probability
+
+    @property
     def shares_errors(self) -> bool:
         """Whether neighbouring pixels share errors: with every amplitude zero, `depth` is `independent`."""
         surface = (self.surface_bias, self.surface_waves, self.model_error, self.object_lean, self.bad_share)

@@ -6,10 +6,8 @@ The rule that tells a lost camera is `_why_lost` in `tracker.py`."""
 MOTION_FREEDOM = 5.0  # degrees of freedom, of the Student t by which motion changes between two frames
 
 # Which returns are the world's (`tracker.py`)
-NEAR_TABLE_PLANE = (
-    0.02,
-    0.02,
-)  # metres, and share of the depth, off its plane within which a return may be the table's
+# Metres, and share of the depth, off its plane within which a return may be the table's.
+NEAR_TABLE_PLANE = (0.02, 0.02)
 NEAR_OBJECT = 0.08  # metres from an object's sphere in which a return may still be its own
 
 # What smooth errors add to the covariance (`tracker.py`, `camera_errors.py`)

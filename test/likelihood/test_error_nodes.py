@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import expit, logsumexp
+from scipy.stats import kstest, truncnorm
 
 from bayes3d_ros.likelihood.error_nodes import (
     AMPLITUDE_LOG_SD,
@@ -177,9 +178,16 @@ def test_noise_is_drawn_about_what_the_scene_moves_it_to(slopes):
     )
     value = jnp.asarray(np.repeat((pairs @ slopes)[:, None], 3, 1)[None] + np.log(HERMITE[1]), jnp.float32)
     draws = 4000
-    noise = sample_noise_at(jax.random.key(0), nodes, jnp.repeat(value, draws, 0))
+    noise = sample_noise_at(jax.random.key(0), nodes, jnp.repeat(value, draws, 0), 0.01)
     drawn = np.stack([np.log(np.asarray(noise.sigma)), logit(np.asarray(noise.p_outlier, float))], 1)
     standard = (drawn - middle) / sd
     assert standard.mean(0) == pytest.approx(slopes, abs=4 / draws**0.5)
     assert standard.std(0) == pytest.approx([1, 1], abs=0.04)
     assert abs(np.corrcoef(standard.T)[0, 1]) < 0.06
+    # A prior of sigma that ends half a standard deviation above the mean cuts the density there.
+    end = middle[0] + sd[0] * (slopes[0] + 0.5)
+    cut = sample_noise_at(jax.random.key(0), nodes, jnp.repeat(value, draws, 0), float(np.exp(end)))
+    below = (np.log(np.asarray(cut.sigma)) - middle[0]) / sd[0] - slopes[0]
+    assert below.max() <= 0.5 + 1e-3
+    np.testing.assert_array_equal(np.asarray(cut.p_outlier), np.asarray(noise.p_outlier))
+    assert kstest(below, truncnorm(-np.inf, 0.5).cdf).pvalue > 0.01

@@ -76,9 +76,9 @@ def test_only_a_closed_world_has_a_second_run(parser, models):
 def test_weights_under_another_model_and_back(models, runs, count):
     context, model, lead = models
     state, number = runs[-1].states[count], jnp.int32(count)
-    same = retargeted(state, number, context, model, model, CLOSED.window)
-    other = retargeted(state, number, context, model, lead, CLOSED.window)
-    back = retargeted(other, number, context, lead, model, CLOSED.window)
+    same = retargeted(state, number, context, model, CLOSED.window)
+    other = retargeted(state, number, context, lead, CLOSED.window)
+    back = retargeted(other, number, context, model, CLOSED.window)
     weight = np.exp(state.log_weight)
     for again in (same, back):
         assert float(again.log_evidence) == pytest.approx(float(state.log_evidence), abs=0.02)

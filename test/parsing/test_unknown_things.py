@@ -11,7 +11,7 @@ from fixtures.plain_tables import at, plain_frame
 
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import UNKNOWN, Library
-from bayes3d_ros.parsing import smc
+from bayes3d_ros.parsing import smc, unknown_things
 from bayes3d_ros.parsing.observe import observe
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.parsing.unknown_things import UNCERTAIN, UnknownThing, before_the_table, drawn_box, in_front
@@ -154,6 +154,23 @@ def test_with_room_for_one_the_larger_thing_is_told(parser):
     assert [o.type for o in one.objects] == [UNKNOWN] and one.num_objects[1] > 0.999
     assert one.log_evidence < -1000  # against things for which there is no room
     np.testing.assert_allclose(np.exp(one.samples.log_weight).sum(), 1, rtol=1e-4)
+
+
+def test_with_room_for_one_the_likelier_thing_is_told(monkeypatch):
+    """Of two things the one that gains less is likelier, where the other would stand on a known object."""
+    seen = observe(plain_frame(BRICK, BALL), SETTINGS)
+    on_object, on_table = (
+        UnknownThing(np.array([k]), gain, np.ones(3), np.zeros(2), 0.0, np.zeros(3), 0.001, np.zeros((1, 2)))
+        for k, gain in enumerate((10.0, 8.0))
+    )
+    monkeypatch.setattr(unknown_things, "_things", lambda mask, seen: (on_object, on_table))
+    support = {id(on_object): np.log(0.01), id(on_table): np.log(0.99)}
+    monkeypatch.setattr(unknown_things, "_log_support", lambda thing, n, known: support[id(thing)])
+    scenes = np.asarray(seen.image.bare_depth)[None]
+    found = unknown_things.find_things(scenes, seen, 0.0, 1, True, np.random.default_rng(0))
+    assert found.held == [(on_table,)]
+    # The likelihood has counted both; the other one's returns are outliers, for which there is no factor.
+    assert found.log_weight[0] == pytest.approx(np.log(0.99) - 10.0)
 
 
 def test_what_stands_outside_the_region_is_not_told(parser):

@@ -171,12 +171,11 @@ def _with_things(
     settings = problem.settings
     kept = samples.weight > np.exp(-NEGLIGIBLE) * samples.weight.max()
     scenes, _ = layers(jax.tree.map(lambda a: a[kept], samples.objects), samples.number[kept], problem)
-    log_prior = float(np.log(settings.count_ratio * settings.unknown_probability))
+    log_prior, rng = float(np.log(settings.unknown_ratio)), np.random.default_rng(0)
     # In float32, as the image has the empty table: by that the parser tells what of a scene is the table.
-    things = find_things(scenes.astype(np.float32), _observation(image, errors, problem), log_prior, 10, False, 0)
+    things = find_things(scenes.astype(np.float32), _observation(image, errors, problem), log_prior, 10, False, rng)
     log_weight = np.full(len(samples.weight), -np.inf)
     log_weight[kept] = np.log(samples.weight[kept]) + things.log_weight
-    log_weight += samples.number * np.log1p(-settings.unknown_probability)
     weight = np.exp(log_weight - log_weight.max())
     some = np.zeros(len(weight), bool)
     some[kept] = [len(held) > 0 for held in things.held]

@@ -250,7 +250,7 @@ def run_shared_sampler(
     them, but for numbers that it leaves out as unlikely."""
     context = Context(jax.device_put(image), problem.library, problem.table)
     guide = None if problem.settings.unknown else with_unknown(image, jax.device_get(model.image))
-    most = problem.settings.max_objects
+    most, sigma_max = problem.settings.max_objects, problem.settings.sigma_max
     runs = sampler_runs(key, context, model, guide, problem.settings, most, -NEGLIGIBLE)
     best = likeliest(runs)
     stages, log_mass = [], []
@@ -259,8 +259,8 @@ def run_shared_sampler(
         told = [run for run in runs if number < len(run.states)]
         for k, run in enumerate(told):
             log_weight = run.log_mass[number] - float(np.log(len(runs)))
-            own_key = jax.random.fold_in(key, 1000 * (k + 1) + number)
-            stages.append(_kept(own_key, run.states[number], number, model, log_weight))
+            own_key = jax.random.fold_in(key, 1000 + 10_000 * k + number)
+            stages.append(_kept(own_key, run.states[number], number, model, log_weight, sigma_max))
             none = np.full(problem.settings.particles, np.inf)  # no weight is left of them
             negligible = log_weight < best.best_log_mass - NEGLIGIBLE
             log_mass.append(none if negligible else log_masses(stages[-1].objects, stages[-1].number, margin, problem))
@@ -271,9 +271,11 @@ def run_shared_sampler(
     )
 
 
-def _kept(key: PRNGKeyArray, state: smc.Population, number: int, model: SharedErrors, log_weight: float) -> Samples:
+def _kept(
+    key: PRNGKeyArray, state: smc.Population, number: int, model: SharedErrors, log_weight: float, sigma_max: float
+) -> Samples:
     """A stage's scenes, with log weights that sum to the stage's."""
-    noise = _sample_noise(key, model, state.loglik_grid)
+    noise = _sample_noise(key, model, state.loglik_grid, sigma_max)
     kept = state.objects, noise.sigma, noise.p_outlier, state.log_likelihood, state.log_weight
     objects, sigma, p_outlier, log_likelihood, weight = jax.device_get(kept)
     return Samples(np.full(len(weight), number), objects, sigma, p_outlier, log_likelihood, weight + log_weight, ess=())
