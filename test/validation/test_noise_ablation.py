@@ -105,7 +105,7 @@ def test_the_summary_tells_what_is_worse_and_what_is_not_better():
     assert told["low: inferred"]["log_score"] == pytest.approx(0.95 * np.log(0.9) + 0.05 * np.log(0.2), abs=1e-4)
     assert told["not_met"] == ["better than good at no level"]
     told = noise_ablation.summary(made_up({INFERRED: 0.5, "good": 1.0}))
-    assert "low: worse than good" in told["not_met"] and "right in low noise: 0.5" in told["not_met"]
+    assert "low: fewer right than good" in told["not_met"] and "right in low noise: 0.5" in told["not_met"]
 
 
 def test_pictures_and_lines(tmp_path):

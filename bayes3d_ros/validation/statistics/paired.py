@@ -31,7 +31,7 @@ def mcnemar(first: Bool[np.ndarray, "N"], second: Bool[np.ndarray, "N"]) -> Pair
 
 
 class Difference(NamedTuple):
-    """A mean, and its 95 % interval."""
+    """A mean, and its interval."""
 
     mean: float
     low: float
@@ -39,12 +39,12 @@ class Difference(NamedTuple):
 
 
 def mean_difference(
-    first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"], group: Int[np.ndarray, "N"]
+    first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"], group: Int[np.ndarray, "N"], share: float = 0.95
 ) -> Difference:
-    """Of first less second. The interval is of a bootstrap over groups of cases (numbered from 0), as cases of a group
-    are alike."""
+    """Of first less second. The interval holds this share of a bootstrap over groups of cases (numbered from 0), as
+    cases of a group are alike."""
     apart, size = np.bincount(group, first - second), np.bincount(group)
     drawn = np.random.default_rng(0).integers(len(size), size=(_RESAMPLED, len(size)))
     means = apart[drawn].sum(1) / size[drawn].sum(1)
-    low, high = np.quantile(means, (0.025, 0.975))
+    low, high = np.quantile(means, ((1 - share) / 2, (1 + share) / 2))
     return Difference(float(apart.sum() / size.sum()), float(low), float(high))
