@@ -9,9 +9,11 @@ In each block of the image the surface is a plane of its own, about a surface th
 
 and its returns err as those of any surface do. With probability 1 - `ANEW` a block goes on from the block to its left
 or from the block above, where there are such: its plane is then the plane of that block, as the returns of that block
-alone tell it, turned by N(0, `BEND_SD`^2) along either axis, half of it between the middles of the two blocks, and
-displaced by N(0, `STEP_SD`^2). So the density of a block's returns depends only on the blocks to its left and above,
-and the product over all blocks integrates to one over all depths.
+alone tell it, turned by N(0, bend^2) along either axis, half of it between the middles of the two blocks, and displaced
+by N(0, step^2). It goes on flat with probability `FLAT_SHARE`, with a step and a bend no larger than a camera's errors
+make them from block to block (`FLAT`), else it bends (`BENT`): most things are flat along some direction. So the
+density of a block's returns depends only on the blocks to its left and above, and the product over all blocks
+integrates to one over all depths.
 
 Each block's integral is computed by Laplace's method about the plane that its returns make likeliest, for all its
 returns that stand in front of the table, and is divided evenly among these returns: a surface pays only for the part of
@@ -29,8 +31,18 @@ from bayes3d_ros.likelihood.scored_image import ScoredImage
 DEPTH_SD = 0.03  # metres
 SLOPE_SD = 1.0
 ANEW = 0.2
-STEP_SD = 0.002  # metres
-BEND_SD = 0.8
+
+
+class GoingOn(NamedTuple):
+    """How a surface goes on from a block to the next: standard deviations."""
+
+    step: float  # metres
+    bend: float  # of the slopes
+
+
+# A camera's waves of a millimetre (the default `surface_waves`) displace blocks of `BLOCK_SIDE` and tilt them.
+FLAT, FLAT_SHARE = GoingOn(0.001, 0.15), 0.5
+BENT = GoingOn(0.002, 0.8)
 _STEPS = 6
 _FIRST_WIDTH = 0.004  # metres: of inliers in the first step; from step to step it shrinks to the noise's
 _MORE_STEPS = 3  # where a plane is followed from the one that is found without neighbours
@@ -141,15 +153,16 @@ def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray,
     beside = (blocks.beside >= 0).sum(0)
     parts = [alone.log_integral + np.log(np.where(beside > 0, ANEW, 1.0))]
     for other in blocks.beside:
-        mean, precision = _going_on(_Planes(*(a[other] for a in alone)), blocks, other)
-        found = _planes(blocks, mean, precision, noise, p, alone.plane).log_integral
-        parts.append(np.where(other >= 0, found + np.log((1 - ANEW) / np.maximum(beside, 1)), -np.inf))
+        for way, share in ((FLAT, FLAT_SHARE), (BENT, 1 - FLAT_SHARE)):
+            mean, precision = _going_on(_Planes(*(a[other] for a in alone)), blocks, other, way)
+            found = _planes(blocks, mean, precision, noise, p, alone.plane).log_integral
+            parts.append(np.where(other >= 0, found + np.log(share * (1 - ANEW) / np.maximum(beside, 1)), -np.inf))
     parts.append(np.where(blocks.real, np.log(p * blocks.outlier), 0).sum(1))  # all of them are outliers
     return np.logaddexp.reduce(parts)
 
 
 def _going_on(
-    planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"]
+    planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"], way: GoingOn
 ) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3 3"]]:
     """Mean and precision of the blocks' planes if they continue these planes, which belong to the blocks `other`."""
     apart = (blocks.centre - blocks.centre[other]) * blocks.metres[other]
@@ -157,7 +170,7 @@ def _going_on(
     move[:, 0, 1:], bend[:, 0, 1:] = apart, apart / 2
     mean = np.einsum("cde,ce->cd", move, planes.plane)
     mean[:, 0] += blocks.middle[other] - blocks.middle
-    change = np.diag([STEP_SD**2, BEND_SD**2, BEND_SD**2])
+    change = np.diag([way.step**2, way.bend**2, way.bend**2])
     covariance = move @ np.linalg.inv(planes.information) @ move.swapaxes(1, 2) + bend @ change @ bend.swapaxes(1, 2)
     return mean, np.linalg.inv(covariance)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from bayes3d_ros.likelihood.own_plane import BEND_SD, DEPTH_SD, SLOPE_SD, STEP_SD
+from bayes3d_ros.likelihood.own_plane import BENT, DEPTH_SD, FLAT, FLAT_SHARE, SLOPE_SD
 
 
 class FittedPlane(NamedTuple):
@@ -33,7 +33,8 @@ def plane_that_goes_on(
 ) -> Float[np.ndarray, "3"]:
     """The plane of a block, metres at its middle and slopes, that goes on from the plane of another block: turned and
     displaced. apart: metres along columns and rows from the middle of the other block."""
-    turned = BEND_SD * rng.standard_normal(2)
+    way = FLAT if rng.random() < FLAT_SHARE else BENT
+    turned = way.bend * rng.standard_normal(2)
     plane = other.plane + np.linalg.cholesky(np.linalg.inv(other.information)) @ rng.standard_normal(3)
-    here = plane[0] + plane[1:] @ apart + turned @ apart / 2 + STEP_SD * rng.standard_normal()
+    here = plane[0] + plane[1:] @ apart + turned @ apart / 2 + way.step * rng.standard_normal()
     return np.append(here, plane[1:] + turned)
