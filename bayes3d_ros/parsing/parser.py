@@ -197,13 +197,13 @@ class SceneParser:
         slots = max(self.settings.max_objects, 1)  # those beyond are empty
         noise = self._sample_noise(key, model, state.loglik_grid)
         gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
-        of_things = jax.random.key_data(jax.random.fold_in(key, 3))
-        (objects, off, log_weight, log_evidence, lineage), gauss, noise, of_things = jax.device_get(
+        seed_of_things = jax.random.key_data(jax.random.fold_in(key, 3))
+        (objects, off, log_weight, log_evidence, lineage), gauss, noise, seed_of_things = jax.device_get(
             (
                 (state.objects, state.warp[..., -1], state.log_weight, state.log_evidence, state.lineage),
                 gauss,
                 noise,
-                of_things,
+                seed_of_things,
             )
         )
         objects, off, lineage = jax.tree.map(lambda a: a[:, :slots], (objects, off, lineage))
@@ -214,7 +214,7 @@ class SceneParser:
         )
         if seen is None or not self.settings.knows_unknown:
             return stage
-        return self._with_things(np.random.default_rng(of_things), stage, state.scenes, count, seen)
+        return self._with_things(np.random.default_rng(seed_of_things), stage, state.scenes, count, seen)
 
     def _with_things(
         self, rng: np.random.Generator, stage: Stage, scenes: Float[Array, "N Hp Wp"], count: int, seen: Observation
