@@ -11,9 +11,8 @@ and its returns err as those of any surface do. With probability 1 - `ANEW` a bl
 or from the block above, where there are such: its plane is then the plane of that block, as the returns of that block
 alone tell it, turned by N(0, bend^2) along either axis, half of it between the middles of the two blocks, and displaced
 by N(0, step^2). It goes on flat with probability `FLAT_SHARE`, with a step and a bend no larger than a camera's errors
-make them from block to block (`FLAT`), else it bends (`BENT`): most things are flat along some direction. So the
-density of a block's returns depends only on the blocks to its left and above, and the product over all blocks
-integrates to one over all depths.
+make them from block to block (`FLAT`), else it bends (`BENT`). So the density of a block's returns depends only on the
+blocks to its left and above, and the product over all blocks integrates to one over all depths.
 
 Each block's integral is computed by Laplace's method about the plane that its returns make likeliest, for all its
 returns that stand in front of the table, and is divided evenly among these returns: a surface pays only for the part of
@@ -40,8 +39,9 @@ class GoingOn(NamedTuple):
     bend: float  # of the slopes
 
 
-# A camera's waves of a millimetre (the default `surface_waves`) displace blocks of `BLOCK_SIDE` and tilt them.
-FLAT, FLAT_SHARE = GoingOn(0.001, 0.15), 0.5
+# A camera's waves of a millimetre (the default `surface_waves`) displace and tilt blocks of `BLOCK_SIDE` so far. The
+# share decides between foreign things that a type fits and dented known ones: docs/decisions/013-unknown-things.md.
+FLAT, FLAT_SHARE = GoingOn(0.001, 0.15), 0.05
 BENT = GoingOn(0.002, 0.8)
 _STEPS = 6
 _FIRST_WIDTH = 0.004  # metres: of inliers in the first step; from step to step it shrinks to the noise's

@@ -267,8 +267,8 @@ def _cylinder(x, y, radius=0.04, away=0.5):
 
 def test_unknown_surfaces_cost_the_same_whatever_their_slope_and_more_where_they_bend():
     costs = [_cost_a_cm2(_tilted(np.radians(a))) for a in (0, 20, 40, 60)]
-    assert 1.3 < min(costs) and max(costs) / min(costs) < 1.12, costs
-    assert 1.2 < _cost_a_cm2(_cylinder) / min(costs) < 1.5
+    assert min(costs) > 2.0 and max(costs) / min(costs) < 1.12, costs
+    assert 1.1 < _cost_a_cm2(_cylinder) / min(costs) < 1.3
 
 
 def test_an_unknown_surface_goes_on_from_block_to_block():
@@ -291,7 +291,7 @@ def test_an_unknown_surface_goes_on_from_block_to_block():
     plane = _tilted(np.radians(30))(rays[..., 0], rays[..., 1]) + noise
     smooth, apart = log_density(plane), log_density(plane + blocks)
     per_block = (smooth - apart)[patch].sum() / 36
-    assert 5 < per_block < 6.5, per_block
+    assert 3.5 < per_block < 4.5, per_block
     moved = plane.copy()
     moved[32:36, 48:52] += 0.004
     changed = np.abs(log_density(moved) - smooth) > 1e-5
