@@ -98,7 +98,7 @@ def _weight_of_pose(found: ObjectEstimate) -> str:
 
 def short(value: float) -> str:
     """Two digits, without an exponent."""
-    return f"{value:.2g}" if 0.01 <= value < 99.5 else f"{value:.0f}" if value >= 99.5 else "<0.01"
+    return f"{value:#.2g}".rstrip(".") if 0.01 <= value < 99.5 else f"{value:.0f}" if value >= 99.5 else "<0.01"
 
 
 def _shorten(text: str, length: int) -> str:

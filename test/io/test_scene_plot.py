@@ -12,6 +12,7 @@ from matplotlib.image import imread
 
 from bayes3d_ros.io.palette import COLOURS, colour
 from bayes3d_ros.io.scene_plot import plot_scene
+from bayes3d_ros.io.scene_words import short
 from bayes3d_ros.io.verdict import scene_verdict
 from bayes3d_ros.posterior.types import UnexplainedPlace, usable_note
 
@@ -76,7 +77,8 @@ def test_the_table_of_numbers_has_headings_with_units_and_a_row_an_object(
         assert heading in texts
     found = posterior.objects[1]
     sigma = 1e3 * np.sqrt(np.trace(found.covariance[:3, :3]))
-    assert {"can", f"{found.probability:.3f}", f"{sigma:.2g}"} <= set(texts)
+    assert {"can", f"{found.probability:.3f}", short(sigma)} <= set(texts)
+    assert [short(value) for value in (2.0, 0.96, 12.3, 150.4, 0.001)] == ["2.0", "0.96", "12", "150", "<0.01"]
     columns = {x for x, _, text in written if text == "1.000"}
     assert len(columns) == 1  # p(type) of all three, below one another
 
