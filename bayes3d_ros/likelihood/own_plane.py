@@ -153,8 +153,8 @@ def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray,
     beside = (blocks.beside >= 0).sum(0)
     parts = [alone.log_integral + np.log(np.where(beside > 0, ANEW, 1.0))]
     for other in blocks.beside:
-        for way, share in ((FLAT, FLAT_SHARE), (BENT, 1 - FLAT_SHARE)):
-            mean, precision = _going_on(_Planes(*(a[other] for a in alone)), blocks, other, way)
+        mean, precisions = _going_on(_Planes(*(a[other] for a in alone)), blocks, other)
+        for precision, share in zip(precisions, (FLAT_SHARE, 1 - FLAT_SHARE), strict=True):
             found = _planes(blocks, mean, precision, noise, p, alone.plane).log_integral
             parts.append(np.where(other >= 0, found + np.log(share * (1 - ANEW) / np.maximum(beside, 1)), -np.inf))
     parts.append(np.where(blocks.real, np.log(p * blocks.outlier), 0).sum(1))  # all of them are outliers
@@ -162,17 +162,18 @@ def _log_densities(blocks: _Blocks, noise: float, p: float) -> Float[np.ndarray,
 
 
 def _going_on(
-    planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"], way: GoingOn
-) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3 3"]]:
-    """Mean and precision of the blocks' planes if they continue these planes, which belong to the blocks `other`."""
+    planes: _Planes, blocks: _Blocks, other: Int[np.ndarray, "C"]
+) -> tuple[Float[np.ndarray, "C 3"], list[Float[np.ndarray, "C 3 3"]]]:
+    """Mean of the blocks' planes if they continue these planes, which belong to the blocks `other`; and their
+    precisions if they go on flat, and if they bend."""
     apart = (blocks.centre - blocks.centre[other]) * blocks.metres[other]
     move, bend = np.tile(np.eye(3), (len(apart), 1, 1)), np.tile(np.eye(3), (len(apart), 1, 1))
     move[:, 0, 1:], bend[:, 0, 1:] = apart, apart / 2
     mean = np.einsum("cde,ce->cd", move, planes.plane)
     mean[:, 0] += blocks.middle[other] - blocks.middle
-    change = np.diag([way.step**2, way.bend**2, way.bend**2])
-    covariance = move @ np.linalg.inv(planes.information) @ move.swapaxes(1, 2) + bend @ change @ bend.swapaxes(1, 2)
-    return mean, np.linalg.inv(covariance)
+    moved = move @ np.linalg.inv(planes.information) @ move.swapaxes(1, 2)
+    changes = [np.diag([way.step**2, way.bend**2, way.bend**2]) for way in (FLAT, BENT)]
+    return mean, [np.linalg.inv(moved + bend @ change @ bend.swapaxes(1, 2)) for change in changes]
 
 
 def _planes(blocks: _Blocks, mean, prior, noise: float, p: float, start: np.ndarray | None) -> _Planes:

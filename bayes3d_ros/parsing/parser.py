@@ -30,15 +30,12 @@ from bayes3d_ros.parsing.explanation import explain
 from bayes3d_ros.parsing.observe import Observation, bare_table, observe
 from bayes3d_ros.parsing.reconstruction import compile_rendering, render_scene
 from bayes3d_ros.parsing.rejuvenation import fewest_moved
-from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, likeliest, moved_again, sampler_runs
+from bayes3d_ros.parsing.sampler_runs import SamplerRun, empty_scenes, kept_key, likeliest, moved_again, sampler_runs
 from bayes3d_ros.parsing.samples import LEAST_LOG_WEIGHT, Stage, mixture, pooled
 from bayes3d_ros.parsing.unknown_things import KnownObjects, UnknownThing, find_things
 from bayes3d_ros.posterior.summarise import summarise
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior, SceneSamples, warning_notes
 from bayes3d_ros.settings import PER_FRAME, ParserSettings
-
-# Folded into a frame's key for what is sampled of each number of objects, and for each run of the sampler.
-_KEPT, _RUNS_APART = 1000, 10_000
 
 
 class SceneParser:
@@ -184,7 +181,7 @@ class SceneParser:
         best = -np.inf
         for count in [len(states) - 1] if only_last else np.argsort(-np.array(log_mass), kind="stable").tolist():
             if log_mass[count] > best + LEAST_LOG_WEIGHT:
-                keys = [jax.random.fold_in(key, _KEPT + _RUNS_APART * r + count) for r in range(len(states[count]))]
+                keys = [kept_key(key, r, count) for r in range(len(states[count]))]
                 kept = [self._keep(k, state, count, model, seen) for k, state in zip(keys, states[count], strict=True)]
                 stages[count] = pooled(kept, len(runs))
                 best = max(best, stages[count].log_evidence + count * np.log(settings.known_ratio))

@@ -29,6 +29,7 @@ from bayes3d_ros.parsing.retarget import retargeted
 from bayes3d_ros.settings import ParserSettings
 
 _SECOND_RUN = 3000  # folded into a frame's key
+_KEPT, _RUNS_APART = 1000, 10_000  # likewise, for what is sampled of each number of objects of each run
 
 
 class SamplerRun(NamedTuple):
@@ -70,6 +71,11 @@ def sampler_runs(
     best = likeliest(runs).best_log_mass
     kept = [(own, run) for own, run in zip(keys, runs, strict=True) if run.best_log_mass >= best - MISSED_NATS]
     return [_peaks_moved(own, run, frame) for own, run in kept]
+
+
+def kept_key(key: PRNGKeyArray, run: int, count: int) -> PRNGKeyArray:
+    """The key, of a frame's, for what is sampled once of a run's scenes of `count` objects."""
+    return jax.random.fold_in(key, _KEPT + _RUNS_APART * run + count)
 
 
 def likeliest(runs: Sequence[SamplerRun]) -> SamplerRun:

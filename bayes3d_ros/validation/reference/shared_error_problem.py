@@ -40,7 +40,7 @@ from bayes3d_ros.objects.placement import Table as PriorTable
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.observe import amplitudes_of
-from bayes3d_ros.parsing.sampler_runs import likeliest, sampler_runs
+from bayes3d_ros.parsing.sampler_runs import kept_key, likeliest, sampler_runs
 from bayes3d_ros.parsing.tuning import SEARCH
 from bayes3d_ros.settings import ParserSettings
 from bayes3d_ros.validation.reference.calibration_problem import NEGLIGIBLE, Samples
@@ -259,7 +259,7 @@ def run_shared_sampler(
         told = [run for run in runs if number < len(run.states)]
         for k, run in enumerate(told):
             log_weight = run.log_mass[number] - float(np.log(len(runs)))
-            own_key = jax.random.fold_in(key, 1000 + 10_000 * k + number)
+            own_key = kept_key(key, k, number)
             stages.append(_kept(own_key, run.states[number], number, model, log_weight, sigma_max))
             none = np.full(problem.settings.particles, np.inf)  # no weight is left of them
             negligible = log_weight < best.best_log_mass - NEGLIGIBLE
