@@ -12,7 +12,9 @@ pytest.importorskip("mujoco", reason="the scenes need MuJoCo (extra: sim)")
 
 from bayes3d_ros.posterior.types import ParseError, SceneSamples
 from bayes3d_ros.validation.experiments import mug_pose
-from bayes3d_ros.validation.experiments.mug_pose import PARSER, KnownMug, ParserStep, Truth
+from bayes3d_ros.validation.experiments.mug_pose_parser import INDEPENDENT, KnownMug, ParserStep, parser_rows
+from bayes3d_ros.validation.experiments.mug_pose_summary import PARSER
+from bayes3d_ros.validation.experiments.mug_pose_truth import Truth
 from bayes3d_ros.validation.networks.von_mises import VonMises
 from bayes3d_ros.validation.reference.exact_yaw import entropy, every_yaw, yaw_axis, yaw_posterior
 from bayes3d_ros.validation.simulate.mug_images import (
@@ -160,7 +162,7 @@ def test_yaws_of_samples_are_those_in_the_tables_frame():
 
 
 @pytest.fixture
-def parser_rows(mug, clean):
+def rows_of_parser(mug, clean):
     """Rows of a stand-in for a parser that gives samples about the true yaw, or fails."""
     images = mug_images(mug, TRAINED, 1, (5,))
     truth = Truth(images, np.array([yaw_posterior(images.depth[0], clean, TRAINED.noise)]), np.ones(1))
@@ -175,22 +177,22 @@ def parser_rows(mug, clean):
             return SimpleNamespace(samples=samples_of(own, np.log([0.5, 0.5]), frame.T_table_camera))
 
         known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, ModelSizes((2048,), 32, 64))
-        step = ParserStep(5, mug_pose.INDEPENDENT)
+        step = ParserStep(5, INDEPENDENT)
         assert [ParserStep(1).method, ParserStep(5, voxel_size=0.002).method] == [PARSER, "Bayes3D (2 mm)"]
-        return mug_pose._parser_rows(step, 0, lambda condition, group: truth, lambda step: known)
+        return parser_rows(step, 0, lambda condition, group: truth, lambda step: known)
 
     return made
 
 
-def test_the_parsers_rows_score_its_samples(parser_rows):
-    row, *others = parser_rows(False)
+def test_the_parsers_rows_score_its_samples(rows_of_parser):
+    row, *others = rows_of_parser(False)
     resultant = float(np.cos(0.05))
     assert row["log_p_true"][0] == pytest.approx(0.5 * np.log(1 / (2 * (1 - resultant)) / (2 * np.pi)), abs=0.01)
     assert row["samples_log_p_true"][0] > 0 and row["failed"] == 0
     assert (row["file_bytes"], row["memory_bytes"], row["padded_memory_bytes"]) == (2048, 32, 64)
     assert row["method"] == "Bayes3D (independent)" and row["training"] == 5
     assert [row["test"], *(o["test"] for o in others)] == list(MUG_CONDITIONS)
-    lost = parser_rows(True)[0]
+    lost = rows_of_parser(True)[0]
     assert lost["failed"] == 1 and lost["log_p_true"][0] == pytest.approx(-np.log(2 * np.pi), abs=1e-3)
 
 

@@ -60,8 +60,7 @@ def weighted_yaws(samples: SceneSamples, T_table_camera: Float[np.ndarray, "4 4"
 
 def kernel_density(samples: WeightedYaws) -> LogDensity:
     """The samples' density, each blurred by a von Mises kernel. The kernel's width is that of KERNELS under which each
-    sample is likeliest given the samples of other draws (Habbema et al. 1974); the widest
-    where there is one draw."""
+    sample is likeliest given the samples of other draws (Habbema et al. 1974); the widest where there is one draw."""
     apart = np.cos(samples.yaw[:, None] - samples.yaw)
     others = np.where(samples.draw[:, None] != samples.draw, samples.weight, 0.0)
     others /= np.maximum(others.sum(1, keepdims=True), np.finfo(float).tiny)

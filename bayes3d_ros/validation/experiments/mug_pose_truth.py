@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Test images of the mug-pose experiment, their exact posteriors, and what a row says of them."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayes3d_ros.validation.experiments import Row
+from bayes3d_ros.validation.networks import von_mises
+from bayes3d_ros.validation.reference.exact_yaw import entropy, every_yaw, yaw_axis, yaw_posterior
+from bayes3d_ros.validation.simulate.mug_images import MUG_CONDITIONS, MugImages, UprightMug, mug_images
+from bayes3d_ros.validation.statistics.yaw_samples import YawScores, circular_sd, yaw_scores
+
+GROUP, QUICK_GROUP = 10, 1  # images of a group
+TEST_SEED = 12
+
+
+class Truth(NamedTuple):
+    """Test images of one camera and place; of each the exact posterior over `yaw_axis()`, and the share of the handle
+    that the mug does not hide."""
+
+    images: MugImages
+    posterior: Float[np.ndarray, "N K"]
+    handle: Float[np.ndarray, "N"]
+
+
+def group_truth(
+    mug: Callable[[], UprightMug],
+    fixed: Callable[[], Float[np.ndarray, "K height width"]],
+    each: int,
+    condition: str,
+    group: int,
+) -> Truth:
+    """A group of test images of a condition. The images of a quick run are the first of a full one's. fixed: what the
+    camera would see at every yaw where neither it nor the mug is moved."""
+    drawn = MUG_CONDITIONS[condition]
+    images = mug_images(mug(), drawn, each, (TEST_SEED, list(MUG_CONDITIONS).index(condition), group))
+    clean = fixed() if drawn.one_view else every_yaw(mug(), images.view, len(fixed()))
+    handle = np.array([mug().handle_in_sight(images.view, yaw) for yaw in images.yaw])
+    return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]), handle)
+
+
+def von_mises_scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], truth: Truth) -> list[YawScores]:
+    axis = yaw_axis(truth.posterior.shape[1])
+    return [
+        yaw_scores(q.log_density, axis, exact, yaw)
+        for q, exact, yaw in zip(said, truth.posterior, truth.images.yaw, strict=True)
+    ]
+
+
+def mug_row(method: str, size: int, condition: str, scores: Sequence[YawScores], groups: Sequence[Truth]) -> Row:
+    """A value an image in each list: of the von Mises, with its standard deviation in degrees; then the exact
+    posterior's own entropy and standard deviation, the cross-entropy of the best von Mises that there is, and the share
+    of the handle in sight."""
+    best = [s.cross_entropy for truth in groups for s in von_mises_scores(_best_fits(truth), truth)]
+    return {
+        "method": method,
+        "training": size,
+        "test": condition,
+        "cross_entropy": [round(s.cross_entropy, 4) for s in scores],
+        "log_p_true": [round(s.log_p_true, 4) for s in scores],
+        "sd": [round(s.sd, 3) for s in scores],
+        "entropy": [round(entropy(exact), 4) for truth in groups for exact in truth.posterior],
+        "exact_sd": [round(circular_sd(yaw_axis(len(p)), p), 3) for truth in groups for p in truth.posterior],
+        "handle": [round(float(share), 3) for truth in groups for share in truth.handle],
+        "best_von_mises": [round(value, 4) for value in best],
+    }
+
+
+def _best_fits(truth: Truth) -> list[von_mises.VonMises]:
+    """The von Mises of least cross-entropy from each exact posterior: its weighted maximum likelihood."""
+    axis = yaw_axis(truth.posterior.shape[1])
+    return [von_mises.fit(axis, exact) for exact in truth.posterior]
