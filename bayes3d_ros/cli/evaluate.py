@@ -79,7 +79,8 @@ def _go_on(report: dict[str, Any], file: Path) -> None:
         return
     if left.steps_done:
         report["steps_done"], report["rows"] = left.steps_done, list(left.rows)
-        report["runs"] = [*left.runs, *(run | {"first_step": left.steps_done} for run in report["runs"])]
+        own = report["runs"] if left.steps_done < report["steps"] else []  # else this run measures nothing
+        report["runs"] = [*left.runs, *(run | {"first_step": left.steps_done} for run in own)]
         click.echo(f"going on after step {left.steps_done} of {report['steps']} ({file})", err=True)
 
 

@@ -141,7 +141,9 @@ def test_nothing_is_prepared_where_the_summary_alone_is_missing(experiment, tmp_
     result = run(tmp_path)
     assert result.exit_code == 0 and "going on after step 4 of 4" in result.stderr
     assert experiment.prepared == 1 and experiment.done == [1, 2, 3, 4]
-    assert json.loads((tmp_path / "planted.json").read_text())["summary"]["rows"] == 10
+    report = json.loads((tmp_path / "planted.json").read_text())
+    assert report["summary"]["rows"] == 10
+    assert [run["first_step"] for run in report["runs"]] == [0]  # the second run measured nothing
 
 
 def test_a_finished_run_is_done_again(experiment, tmp_path: Path) -> None:
