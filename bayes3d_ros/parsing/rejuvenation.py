@@ -51,7 +51,6 @@ class GivenFrame(NamedTuple):
     model: ImageModel
     empty: Empty
     window: int
-    overlap_limit: float
     ess_threshold: float
 
 
@@ -102,7 +101,7 @@ def _move(
     heats: Int[Array, ""],
 ) -> WeightedScenes:
     """Move the object in slot m of every scene."""
-    context, model, empty, window, overlap_limit, _ = frame
+    context, model, empty, window, _ = frame
     _, library, table = context
     particles, slots = state.solo_gain.shape
     others = jnp.arange(slots) != m
@@ -122,7 +121,7 @@ def _move(
         log_q = log_density(placement, proposal, library, table)
         log_target = log_likelihood + log_prior(placement, library, table) + log_order(solo_gain, count)
         log_ratio = log_target - log_likelihood_without[ancestor] - log_q
-        clash = conflicts(placement, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library, overlap_limit)
+        clash = conflicts(placement, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
         return Proposed(ancestor, placement, grid_here, log_likelihood, log_q, log_ratio, warp, solo_gain=solo_gain)
 

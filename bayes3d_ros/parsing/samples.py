@@ -68,6 +68,29 @@ def pooled(stages: Sequence[Stage], runs: int) -> Stage:
     )
 
 
+class _Kept(NamedTuple):
+    """S scenes of all stages, two of each scene that is kept."""
+
+    objects: Placement  # [S, M]
+    num_known: Int[np.ndarray, "S"]
+    gauss: Float[np.ndarray, "S M2 3"]  # as in a stage; of opposite signs in the two of a scene, so that means stay
+    off: Float[np.ndarray, "S M"]
+    log_weight: Float[np.ndarray, "S"]
+    p_outlier: Float[np.ndarray, "S"]
+    sigma: Float[np.ndarray, "S"]
+    things: list[tuple[UnknownThing, ...]]
+    lineage: Int[np.ndarray, "S M"]
+
+
+class _Slots(NamedTuple):
+    """Objects of S samples; type -1 where there is none."""
+
+    type: Int[np.ndarray, "S M"]
+    face: Int[np.ndarray, "S M"]
+    T_camera_object: Float[np.ndarray, "S M 4 4"]
+    size: Float[np.ndarray, "S M 3"]  # metres; 0 of library types
+
+
 def mixture(
     stages: Sequence[Stage],
     counts: Sequence[int],
@@ -82,49 +105,70 @@ def mixture(
     things of each sample. counts: numbers of known objects of the stages; outline: standard deviation of the
     displacement of an object's picture, as an angle's tangent; bias: of the depth of an object's returns against the
     table's, metres."""
-    log_z = np.array([s.log_evidence for s in stages])
-    log_evidence = np.logaddexp.reduce(log_prior + log_z)
-    log_weight = np.concatenate([s.log_weight + p + z for s, p, z in zip(stages, log_prior, log_z, strict=True)])
-    log_weight -= np.logaddexp.reduce(log_weight)
-    n = np.repeat(counts, [len(s.log_weight) for s in stages])
-    keep = np.flatnonzero(log_weight > LEAST_LOG_WEIGHT)
-    objects = jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages))
-    things = [held for s in stages for held in s.things]
-    things = [things[k] for k in keep] if things else [()] * len(keep)
-    # Each scene twice, with errors of opposite signs, so that means do not move.
-    gauss = np.concatenate([s.gauss for s in stages])[keep]
-    gauss = np.repeat(gauss, 2, 0) * np.resize([1.0, -1.0], 2 * len(keep))[:, None, None]
-    lineage = _apart([s.lineage for s in stages])[keep]
-    keep, table_error = np.repeat(keep, 2), gauss[:, 0] * seen.error_sd + seen.error
-    objects = _beside_pictures(
-        jax.tree.map(lambda a: np.repeat(a, 2, 0), objects), gauss[:, 2:], library, table, outline
+    log_share = log_prior + np.array([s.log_evidence for s in stages])
+    kept = _kept_twice(stages, counts, log_share)
+    moved = _moved(kept.gauss[:, 0] * seen.error_sd + seen.error)
+    slots = _with_things(
+        _known(kept, moved, library, table, outline, bias),
+        kept.num_known,
+        kept.things,
+        int(library.num_types),
+        np.asarray(table.T_camera_table, np.float64),
+        moved,
     )
-    things = [held for held in things for _ in range(2)]
-    moved = _moved(table_error)
-    held = np.arange(objects.type.shape[1]) < n[keep, None]
-    T_camera_table = np.asarray(table.T_camera_table, np.float64)
-    off = np.concatenate([s.off for s in stages])[keep]
-    T = _on_true_table(objects, T_camera_table, moved, library)
-    T = _along_rays(T, _table_bias(off, held, gauss[:, 1, 0], bias))
-    kinds, faces = (np.where(held, a, -1) for a in (objects.type, objects.face))
-    known = _Slots(kinds, faces, T, np.zeros((*held.shape, 3)))
-    every = _with_things(known, n[keep], things, int(library.num_types), T_camera_table, moved)
-    held = every.type >= 0
-    T = every.T_camera_object
-    quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
-    samples = SceneSamples(
-        log_weight=(log_weight[keep] - np.logaddexp.reduce(log_weight[keep])).astype(np.float32),
-        num_objects=held.sum(1).astype(np.int32),
-        type=every.type.astype(np.int32),
-        face=every.face.astype(np.int32),
-        position=np.where(held[..., None], T[..., :3, 3], 0.0).astype(np.float32),
-        orientation=np.where(held[..., None], quaternion, [0, 0, 0, 1]).astype(np.float32),
+    return _scene_samples(kept, slots), float(np.logaddexp.reduce(log_share)), kept.things
+
+
+def _kept_twice(stages: Sequence[Stage], counts: Sequence[int], log_share: Float[np.ndarray, "stages"]) -> _Kept:
+    """Scenes of enough weight, of all stages; log_share: of the posterior's mass in each stage, up to a constant."""
+    log_weight = np.concatenate([s.log_weight + share for s, share in zip(stages, log_share, strict=True)])
+    log_weight -= np.logaddexp.reduce(log_weight)
+    keep = np.repeat(np.flatnonzero(log_weight > LEAST_LOG_WEIGHT), 2)
+    things = [held for s in stages for held in s.things]
+    gauss = np.concatenate([s.gauss for s in stages])[keep]
+    return _Kept(
+        objects=jax.tree.map(lambda *parts: np.concatenate(parts)[keep], *(s.objects for s in stages)),
+        num_known=np.repeat(counts, [len(s.log_weight) for s in stages])[keep],
+        gauss=gauss * np.resize([1.0, -1.0], len(keep))[:, None, None],
+        off=np.concatenate([s.off for s in stages])[keep],
+        log_weight=log_weight[keep] - np.logaddexp.reduce(log_weight[keep]),
         p_outlier=np.concatenate([s.p_outlier for s in stages])[keep],
         sigma=np.concatenate([s.sigma for s in stages])[keep],
-        size=every.size.astype(np.float32),
-        draw=_draws(np.repeat(lineage, 2, 0), held, n[keep]),
+        things=[things[k] for k in keep] if things else [()] * len(keep),
+        lineage=_apart([s.lineage for s in stages])[keep],
     )
-    return samples, float(log_evidence), things
+
+
+def _known(
+    kept: _Kept, moved: Float[np.ndarray, "S 1 4 4"], library: LibraryArrays, table: Table, outline: float, bias: float
+) -> _Slots:
+    """The known objects of each scene, where they stand once the errors are drawn that the likelihood integrates out.
+    moved: the table's errors."""
+    held = np.arange(kept.objects.type.shape[1]) < kept.num_known[:, None]
+    objects = _beside_pictures(kept.objects, kept.gauss[:, 2:], library, table, outline)
+    T = _on_true_table(objects, np.asarray(table.T_camera_table, np.float64), moved, library)
+    T = _along_rays(T, _table_bias(kept.off, held, kept.gauss[:, 1, 0], bias))
+    kinds, faces = (np.where(held, a, -1) for a in (objects.type, objects.face))
+    return _Slots(kinds, faces, T, np.zeros((*held.shape, 3)))
+
+
+def _scene_samples(kept: _Kept, slots: _Slots) -> SceneSamples:
+    """What is published of the scenes. slots: their objects, known and unknown."""
+    held = slots.type >= 0
+    T = slots.T_camera_object
+    quaternion = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*held.shape, 4)
+    return SceneSamples(
+        log_weight=kept.log_weight.astype(np.float32),
+        num_objects=held.sum(1).astype(np.int32),
+        type=slots.type.astype(np.int32),
+        face=slots.face.astype(np.int32),
+        position=np.where(held[..., None], T[..., :3, 3], 0.0).astype(np.float32),
+        orientation=np.where(held[..., None], quaternion, [0, 0, 0, 1]).astype(np.float32),
+        p_outlier=kept.p_outlier,
+        sigma=kept.sigma,
+        size=slots.size.astype(np.float32),
+        draw=_draws(kept.lineage, held, kept.num_known),
+    )
 
 
 def _apart(lineages: Sequence[Int[np.ndarray, "_ M"]]) -> Int[np.ndarray, "N M"]:
@@ -183,15 +227,6 @@ def _along_rays(T: Float[np.ndarray, "S M 4 4"], depth: Float[np.ndarray, "S"]) 
     z = np.where(T[..., 2, 3] > 0, T[..., 2, 3], np.inf)
     moved[..., :3, 3] *= (1 + depth[:, None] / z)[..., None]
     return moved
-
-
-class _Slots(NamedTuple):
-    """Objects of S samples; type -1 where there is none."""
-
-    type: Int[np.ndarray, "S M"]
-    face: Int[np.ndarray, "S M"]
-    T_camera_object: Float[np.ndarray, "S M 4 4"]
-    size: Float[np.ndarray, "S M 3"]  # metres; 0 of library types
 
 
 def _with_things(

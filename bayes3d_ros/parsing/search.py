@@ -24,6 +24,7 @@ from bayes3d_ros.objects.placement import Placement, left_out, log_prior, moved_
 from bayes3d_ros.objects.self_symmetry import TURNED
 from bayes3d_ros.parsing.alignment import align
 from bayes3d_ros.parsing.coarse_search import (
+    CellsInReach,
     UnexplainedReturns,
     cell_grid,
     cells_to_search,
@@ -47,6 +48,7 @@ from bayes3d_ros.parsing.mode_search import (
     with_self_symmetry,
 )
 from bayes3d_ros.parsing.neighbour_depth import neighbour_depth
+from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density
 from bayes3d_ros.parsing.selection import best_of_types, chosen_first, distinct, together, types_first
 from bayes3d_ros.parsing.tuning import SAMPLER, SEARCH
@@ -87,30 +89,52 @@ def unexplained_returns(scene_depth: Float[Array, "H W"], image: ScoredImage, no
 
 
 def conflicts(
-    placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays, limit: float
+    placement: Placement, others: Placement, count: Int[Array, "*n"], library: LibraryArrays
 ) -> Bool[Array, "N"]:
-    """Whether an object interpenetrates any of the first `count` others by more than `limit`; placement [N], others
-    [N, M]."""
+    """Whether an object interpenetrates any of the first `count` others by more than `OVERLAP_LIMIT`; placement [N],
+    others [N, M]."""
 
     def with_other(m: Int[Array, ""], worst: Float[Array, "N"]) -> Float[Array, "N"]:
         share = overlap(placement, jax.tree.map(lambda a: a[:, m], others), library)
         return jnp.maximum(worst, jnp.where(m < count, share, 0.0))
 
-    return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(placement.type.shape)) > limit
+    return jax.lax.fori_loop(0, jnp.max(count), with_other, jnp.zeros(placement.type.shape)) > OVERLAP_LIMIT
 
 
 def candidates(
-    scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int], overlap_limit: float
+    scene: LeadScene, returns: UnexplainedReturns, context: Context, shape: tuple[int, int]
 ) -> tuple[Hypotheses, Float[Array, "C"]]:
     """The coarse levels: cells are scored, the best are aligned, and near-copies and impossible hypotheses are
     dropped."""
     image, library, table = context
     cells = cells_to_search(returns, library, image, table, shape)
     scores = score_cells(cells, returns, image, library, table)
+    placement, coarse = _best_of_cells(cells, scores)
+    placement, information = align(placement, returns, image, library, table)
+    # Alignment carries an object at the border of the table, or of the region, across the border.
+    placement = moved_into_room(placement, library, table)
+    loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
+    found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
+    score = surface_score(
+        placement, returns, image, library, table, SEARCH.aligned_tolerance, SEARCH.aligned_penalty, SURFACE_SAMPLES
+    )
+    score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
+    others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
+    clash = conflicts(placement, others, scene.num_objects, library)
+    found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
+    score = distinct(found.placement, score, SEARCH.candidates_apart)
+    first = best_of_types(found.placement.type, score, SEARCH.candidates_a_type, scores.shape[1])
+    return chosen_first(found, score, first, min(SEARCH.candidates, len(score)))
+
+
+def _best_of_cells(cells: CellsInReach, scores: Float[Array, "C T F Y"]) -> tuple[Placement, Float[Array, "N"]]:
+    """The hypotheses that are aligned, and their coarse scores. scores: of every cell, type, face and step of yaw.
+
+    They are the best (cell, type, face), each at the best yaw of every quarter turn (a part that looks alike all around
+    leaves the coarse score flat in yaw); and for every type and face the best of every quarter turn: none is shut out
+    by a crowd of another.
+    """
     types = scores.shape[1]
-    # The best overall, each at the best yaw of every quarter turn (a part that looks alike all around leaves the coarse
-    # score flat in yaw); and for every type and face the best of every quarter turn: none is shut out by a crowd of
-    # another.
     _, index = jax.lax.top_k(scores.max(-1).ravel(), SEARCH.best_cells)
     part = SEARCH.yaws // SEARCH.quarters
     per_face = scores.reshape(-1, types, NUM_FACES, SEARCH.quarters, part).transpose(1, 2, 3, 0, 4)
@@ -124,24 +148,9 @@ def candidates(
     cell = jnp.concatenate([jnp.repeat(cell, SEARCH.quarters), first // part])
     type_id = jnp.concatenate([jnp.repeat(type_id, SEARCH.quarters), each_type])
     face = jnp.concatenate([jnp.repeat(face, SEARCH.quarters), each_face])
-    coarse = scores[cell, type_id, face, yaw]
     x, y = cells.centre[cell].T
     placement = Placement(type_id, face, x, y, (yaw + 0.5) * (2 * jnp.pi / SEARCH.yaws))
-    placement, information = align(placement, returns, image, library, table)
-    # Alignment carries an object at the border of the table, or of the region, across the border.
-    placement = moved_into_room(placement, library, table)
-    loose = jnp.diag(1 / jnp.array(SEARCH.align_looseness) ** 2)
-    found = Hypotheses(placement, factor(jnp.linalg.inv(information / SEARCH.aligned_residual**2 + loose)))
-    score = surface_score(
-        placement, returns, image, library, table, SEARCH.aligned_tolerance, SEARCH.aligned_penalty, SURFACE_SAMPLES
-    )
-    score = jnp.where(jnp.isfinite(coarse) & jnp.isfinite(log_prior(placement, library, table)), score, -jnp.inf)
-    others = jax.tree.map(lambda a: jnp.broadcast_to(a, (score.shape[0], *a.shape)), scene.objects)
-    clash = conflicts(placement, others, scene.num_objects, library, overlap_limit)
-    found, score = best_first(found, jnp.where(clash, -jnp.inf, score), score.shape[0])
-    score = distinct(found.placement, score, SEARCH.candidates_apart)
-    first = best_of_types(found.placement.type, score, SEARCH.candidates_a_type, types)
-    return chosen_first(found, score, first, min(SEARCH.candidates, len(score)))
+    return placement, scores[cell, type_id, face, yaw]
 
 
 def _gains(
@@ -160,7 +169,6 @@ def find_proposal(
     model: ImageModel,
     table_size: tuple[float, float],
     window: int,
-    overlap_limit: float,
 ) -> tuple[Proposal, Float[Array, "L"]]:
     """The proposal for one more object, given the scene that represents the population; and the exponents of the
     path from the proposal to the target."""
@@ -171,7 +179,7 @@ def find_proposal(
     shape = cell_grid(table_size)
     depth = scene.depth[half : half + height, half : half + width]
     returns = unexplained_returns(depth, image, noise)
-    found, score = candidates(scene, returns, context, shape, overlap_limit)
+    found, score = candidates(scene, returns, context, shape)
     rough = _rough_gains(scene.depth, context, noise, window)
     found, best = _starts(found, score, rough, library)
     worth = best > SEARCH.worth_nats

@@ -30,7 +30,6 @@ from bayes3d_ros.parsing.coarse_search import cell_grid
 from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
 from bayes3d_ros.parsing.mode_search import COMPONENTS
-from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
 from bayes3d_ros.parsing.search import LeadScene, conflicts, find_proposal
@@ -117,7 +116,7 @@ def step(
     ancestor, log_weight = resample(resample_key, jnp.arange(particles), state.log_weight, ess_threshold)
 
     scene = _heaviest(state, ancestor, log_weight, count)
-    proposal, exponents = find_proposal(search_key, scene, context, model, table_size, window, OVERLAP_LIMIT)
+    proposal, exponents = find_proposal(search_key, scene, context, model, table_size, window)
 
     def extend(ancestor: Int[Array, "N"], new: Placement) -> Proposed:
         gained, warp = gain(model, new, ancestor, state.scenes, context, window)
@@ -126,7 +125,7 @@ def step(
         log_q = log_density(new, proposal, library, table)
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
-        clash = conflicts(new, others, count, library, OVERLAP_LIMIT)
+        clash = conflicts(new, others, count, library)
         log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
         lineage = jnp.arange(len(ancestor))
         return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, warp, lineage)
@@ -194,7 +193,7 @@ def rejuvenated(
 ) -> Population:
     """The same posterior of scenes of `count` objects, some of them moved."""
     scenes = WeightedScenes(*(getattr(state, name) for name in WeightedScenes._fields))
-    frame = GivenFrame(context, model, state.empty, window, OVERLAP_LIMIT, ess_threshold)
+    frame = GivenFrame(context, model, state.empty, window, ess_threshold)
     return state._replace(**rejuvenate(key, scenes, state.proposals, count, frame, effort)._asdict())
 
 

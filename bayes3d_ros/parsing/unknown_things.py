@@ -154,18 +154,40 @@ def before_the_table(seen: Observation) -> tuple[slice, slice]:
 
 def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownThing, ...]:
     """Regions of returns that may be things, most returns first."""
-    errors = seen.errors
-    assert errors is not None
-    node = len(errors.nodes.sigma) // 2
-    height, width = mask.shape
-    outlier = float(np.asarray(seen.image.outlier_scale)) * np.maximum(seen.depth, 1e-6) ** 2
-    gain = errors.own_plane[node, :height, :width] - np.log(float(errors.nodes.p_outlier[node]) * outlier)
     T = seen.T_camera_table
     points = (unproject(np.where(mask, seen.depth, np.nan), seen.camera) - T[:3, 3]) @ T[:3, :3]
     regions, count = _regions(mask, seen.depth, seen.pixel_class != NO_RETURN, points)
     if count == 0:
         return ()
-    inside = seen.pixel_class == IN_WORKSPACE
+    label = np.arange(count + 1)
+    sides = _sides(regions, count, seen.pixel_class == IN_WORKSPACE)
+    log_gain = ndimage.sum_labels(_over_outliers(seen), regions, label) - OUTLINE_NATS * sides
+    area = ndimage.sum_labels(seen.depth**2, regions, label) / (seen.camera.fx * seen.camera.fy)
+    camera = -T[:3, :3].T @ T[:3, 3]
+    found = []
+    for k in np.argsort(-np.bincount(regions.ravel(), minlength=count + 1)[1:], kind="stable") + 1:
+        if area[k] < LEAST_THING or log_gain[k] <= 0:
+            continue
+        own = regions == k
+        size, centre, yaw, behind = _box(points[own], camera[:2])
+        pixel = float(np.median(seen.depth[own])) / seen.camera.fx
+        floor = points[own][:: -(-int(own.sum()) // _FLOOR_POINTS), :2]
+        found.append(UnknownThing(np.flatnonzero(own), float(log_gain[k]), size, centre, yaw, behind, pixel, floor))
+    return tuple(found)
+
+
+def _over_outliers(seen: Observation) -> Float[np.ndarray, "h w"]:
+    """Nats of each return as an unknown surface's over an outlier's, at the middle node of the errors."""
+    errors = seen.errors
+    assert errors is not None
+    node = len(errors.nodes.sigma) // 2
+    height, width = seen.depth.shape
+    outlier = float(np.asarray(seen.image.outlier_scale)) * np.maximum(seen.depth, 1e-6) ** 2
+    return errors.own_plane[node, :height, :width] - np.log(float(errors.nodes.p_outlier[node]) * outlier)
+
+
+def _sides(regions: Int[np.ndarray, "h w"], count: int, inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "K"]:
+    """Sides of pixels along the outline of each region, from 0 (none) to `count`: between pixels in the workspace."""
     sides = np.zeros(count + 1)
     for one, other in (
         ((slice(None, -1),), (slice(1, None),)),
@@ -174,20 +196,7 @@ def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownTh
         apart = inside[one] & inside[other] & (regions[one] != regions[other])
         for part in (one, other):
             sides += np.bincount(regions[part][apart], minlength=count + 1)
-    total = ndimage.sum_labels(gain, regions, np.arange(count + 1))
-    area = ndimage.sum_labels(seen.depth**2, regions, np.arange(count + 1)) / (seen.camera.fx * seen.camera.fy)
-    camera = -T[:3, :3].T @ T[:3, 3]
-    found = []
-    for k in np.argsort(-np.bincount(regions.ravel(), minlength=count + 1)[1:], kind="stable") + 1:
-        log_gain = float(total[k] - OUTLINE_NATS * sides[k])
-        if area[k] < LEAST_THING or log_gain <= 0:
-            continue
-        own = regions == k
-        size, centre, yaw, behind = _box(points[own], camera[:2])
-        pixel = float(np.median(seen.depth[own])) / seen.camera.fx
-        floor = points[own][:: -(-int(own.sum()) // _FLOOR_POINTS), :2]
-        found.append(UnknownThing(np.flatnonzero(own), log_gain, size, centre, yaw, behind, pixel, floor))
-    return tuple(found)
+    return sides
 
 
 def _regions(

@@ -16,7 +16,6 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.parsing import smc
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.posterior_constants import OVERLAP_LIMIT
 from bayes3d_ros.parsing.search import conflicts
 
 PARTICLES, MAX_OBJECTS, WINDOW, SIGMA_MAX = 256, 3, 3, 0.006
@@ -58,7 +57,7 @@ def gains(context, grid, board, empty):
     @jax.jit
     def of_block(placement):
         gain = log_likelihood_gain(placement, first, alone, *context, grid.coarse, WINDOW)
-        clash = conflicts(placement, others, jnp.int32(1), context.library, OVERLAP_LIMIT)
+        clash = conflicts(placement, others, jnp.int32(1), context.library)
         shown = render_objects(placement, jnp.broadcast_to(alone, (BLOCK, *alone.shape[1:])), *context, WINDOW)
         value = log_marginal(table + gain, grid) - log_marginal(table, grid)
         return jnp.where(clash, -jnp.inf, value), ~clash & (shown == alone).all((1, 2))
