@@ -85,7 +85,8 @@ class SettingsParameters:
             self._use_default(field)
 
     def _replace_invalid(self, kind: type) -> None:
-        """Put defaults where the dataclass refuses a value, one after the other: it names one at a time."""
+        """Put defaults where the dataclass refuses a value, one after the other. Errors begin with the setting's name;
+        where that has its default already, another one that the error names is wrong (near and far)."""
         named = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
         while True:
             try:
@@ -94,11 +95,17 @@ class SettingsParameters:
             except UnfinishedSettings:
                 return  # `read` refuses them until the others are set
             except ValueError as error:
-                name = re.split(r"\W", str(error), maxsplit=1)[0]  # errors begin with the setting's name
-                if name not in named or name in self.problems:
+                wrong = [field for field in map(named.get, re.findall(r"\w+", str(error))) if field is not None]
+                wrong = [field for field in wrong if self._differs(field)]
+                if not wrong:
                     raise
-                self.problems[name] = f"parameter {error}"
-                self._use_default(named[name])
+                self.problems[wrong[0].name] = f"parameter {error}"
+                self._use_default(wrong[0])
+
+    def _differs(self, field: Field) -> bool:
+        """Whether a parameter has another value than its default."""
+        value = self._node.get_parameter(field.name).value
+        return repr(_typed(field, value)) != repr(field.default)  # as NaN is not equal to NaN
 
     def _check_names(self) -> None:
         """Look at the names that files and the command line give values for: rclpy drops those it does not know."""

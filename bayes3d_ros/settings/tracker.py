@@ -144,5 +144,7 @@ class TrackerSettings:
         validate(self)
         check_window(self.window)
         check_depths(self.near, self.far)
-        if self.nearest_camera > self.farthest_camera or self.lowest_camera > self.highest_camera:
-            raise ValueError("nearest_camera and lowest_camera must not exceed farthest_camera and highest_camera")
+        for low, high, unit in (("nearest_camera", "farthest_camera", "m"), ("lowest_camera", "highest_camera", "rad")):
+            least, most = getattr(self, low), getattr(self, high)
+            if least > most:
+                raise ValueError(f"{low} ({least:g} {unit}) must not exceed {high} ({most:g} {unit})")

@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.ros.node_settings import (
+    CAMERA_TRACKER_SETTINGS,
     NODE_SETTINGS,
     OBJECT_LEARNER_SETTINGS,
     SCENE_PARSER_SETTINGS,
@@ -97,6 +98,7 @@ def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, Sett
         with_values("table:=chair"),
         with_values("window:=4"),
         with_values("near:=6.0"),
+        with_values("far:=0.01"),
         with_values("types:=mug"),
         with_values("types:=[1, 2]"),
         with_values("region:=[0.0, 0.1]"),
@@ -125,10 +127,30 @@ def test_a_bad_value_at_the_start_is_named_in_one_line_and_the_node_lives(
 ) -> None:
     _, parameters = declared
     name = request.node.callspec.params["declared"][1].split(":=")[0]
-    with pytest.raises(ValueError, match=f"parameter {name}") as error:
+    with pytest.raises(ValueError, match=f"parameter .*{name}") as error:
         for kind in SCENE_PARSER_SETTINGS:
             parameters.read(kind)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "values, wrong",
+    [
+        (("farthest_camera:=0.25",), {"farthest_camera"}),
+        (("nearest_camera:=2.0",), {"nearest_camera"}),
+        (("lowest_camera:=1.45", "highest_camera:=0.1"), {"lowest_camera", "highest_camera"}),
+        (("nearest_camera:=0.6", "farthest_camera:=0.5"), {"nearest_camera"}),
+    ],
+)
+def test_of_two_values_that_do_not_fit_the_wrong_one_is_named(context: rclpy.Context, values, wrong) -> None:
+    node = Node("camera_tracker", context=context, cli_args=["--ros-args", *with_values(*values)])
+    try:
+        parameters = SettingsParameters(node, CAMERA_TRACKER_SETTINGS)
+    finally:
+        node.destroy_node()
+    assert parameters.problems.keys() == wrong
+    for name, problem in parameters.problems.items():
+        assert "must not exceed" in problem and name in problem
 
 
 @pytest.mark.parametrize(
