@@ -85,7 +85,7 @@ def track(
     enable_cache()
     every_core()
     told = None if world is None else load_world(world, settings.table, models)
-    follower = CameraFollower(CameraTracker(models, settings), parser_of_worlds(models), told)
+    follower = CameraFollower(CameraTracker(models, settings), parser_of_worlds(models, settings), told)
     around = "what its first frame shows" if told is None else ", ".join(told.types)
     click.echo(f"following the camera around {around}")
     recording = writers.TrackRecording(mcap, table_frame) if writers else NoRecording()
@@ -95,11 +95,14 @@ def track(
         raise click.ClickException(f"{bag}: its camera could not be tracked ({failed} of {failed} frames failed)")
     estimates, recorded = zip(*done, strict=True)
     lost = sum(bool(estimate.lost) for estimate in estimates)
-    summary = f"{len(done)} frame{'s' * (len(done) != 1)} tracked" + (f", lost in {lost}" if lost else "")
+    tracked = len(done) - lost
+    summary = f"{tracked} frame{'s' * (tracked != 1)} tracked" + (f", lost in {lost}" if lost else "")
     summary += f", {failed} could not be" if failed else ""
     title, by_name = f"{bag.name}   {frames.depth_topic}   {summary}", models.by_name
-    plot_track(estimates, out / PICTURE_FILE, title, recorded, world_seen, by_name, settings.least_explained)
+    plot_track(estimates, out / PICTURE_FILE, title, recorded, world_seen, by_name, settings.least_explained, failed)
     click.echo(f"{summary}; results in {out}" + (f" and {mcap}" if mcap else ""))
+    if not tracked:
+        raise click.ClickException(f"{bag}: its camera is lost in every frame: {estimates[0].lost}")
 
 
 def _follow(

@@ -54,18 +54,19 @@ def plot_track(
     world: KnownWorld | None = None,
     models: Mapping[str, ObjectModel] | None = None,
     least_explained: float | None = None,
+    failed: int = 0,
 ) -> Path:
     """Write a PNG: the objects and the camera's path from above; errors of position (millimetres) and of orientation
     (degrees) where poses were recorded, else standard deviations; and what of the objects is explained. Frames in which
     the camera is lost are shaded.
 
     given: the recorded T_table_camera of every frame, or None. world, models: what the camera is tracked by.
-    least_explained: the setting of this name; by default its default.
+    least_explained: the setting of this name; by default its default. failed: how many frames have no estimate.
     """
     figure = Figure(figsize=(16, 9), facecolor="white")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13, color=INK, y=0.985)
-    verdict = track_verdict(estimates)
+    verdict = track_verdict(estimates, failed)
     words = "\n".join(wrap(verdict.words, 150)[:2])
     figure.text(0.05, 0.95, words, fontsize=10.5, fontweight="bold", color=GOOD if verdict.healthy else BAD, va="top")
     grid = figure.add_gridspec(3, 2, left=0.05, right=0.985, top=0.87, bottom=0.06, hspace=0.3, wspace=0.13)

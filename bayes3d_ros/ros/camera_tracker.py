@@ -24,7 +24,7 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
-from bayes3d_ros.ros.diagnostics import ERROR, OK, QUIET, REPEAT
+from bayes3d_ros.ros.diagnostics import ERROR, QUIET, REPEAT
 from bayes3d_ros.ros.node_settings import CAMERA_TRACKER_SETTINGS, DEPTH_INPUT_PARAMETERS, CameraTrackerNodeSettings
 from bayes3d_ros.ros.qos import RELIABLE
 from bayes3d_ros.ros.spinning import run_node
@@ -35,7 +35,8 @@ from bayes3d_ros.tracking.session import CameraFollower, parser_of_worlds
 from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
 from bayes3d_ros.tracking.world_file import load_world
 
-_TRACKER_PARAMETERS = {"library", "world", *(f.name for f in fields(TrackerSettings))}
+# Setting one of these begins anew: it changes the world, its frame's name, or how the camera is followed in it.
+_TRACKER_PARAMETERS = {"library", "world", "table_frame", *(f.name for f in fields(TrackerSettings))}
 
 _PURPOSE = "Depth images in, where the camera is in the world that it first saw out."
 
@@ -45,7 +46,7 @@ class Follower(Protocol):
 
     def compiled_for(self, width: int, height: int, known: Tracking | None) -> bool: ...
 
-    def step(self, known: Tracking | None, frame, /) -> tuple[Tracking, CameraEstimate]: ...
+    def step(self, known: Tracking | None, frame, waited: float, /) -> tuple[Tracking, CameraEstimate]: ...
 
 
 class _Session(NamedTuple):
@@ -53,11 +54,14 @@ class _Session(NamedTuple):
 
     follower: Follower
     backend: str
+    begun: int  # how many trackers have been begun, this one included
+    table_frame: str
+    world_told: bool  # by a file; else the first frame shows it
 
 
 def make_follower(library: Library, settings: TrackerSettings, world: KnownWorld | None) -> Follower:
     """A tracker for the objects of a library, and a parser for its first frame, or a world that is known."""
-    return CameraFollower(CameraTracker(library, settings), parser_of_worlds(library), world)
+    return CameraFollower(CameraTracker(library, settings), parser_of_worlds(library, settings), world)
 
 
 class CameraTrackerNode(Node):
@@ -77,6 +81,10 @@ class CameraTrackerNode(Node):
         )
         self._session: _Session | None = None
         self._known: Tracking | None = None  # the worker's own
+        self._waited = 0.0  # seconds that the last frame's search took the worker's time; its own too
+        self._has_pose = False  # whether the last frame gave one
+        self._begun = 0
+        self._places_world = True  # whether the next frame places the world's frame, and needs the camera's pose
         self._told = ""
         self._path = CameraPath(self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", RELIABLE)
@@ -103,19 +111,26 @@ class CameraTrackerNode(Node):
             library = library_in(node.library)
             world = load_world(Path(node.world).expanduser(), settings.table, library) if node.world else None
         except (ValueError, LibraryError, WorldError) as error:
-            self._parts.refuse(str(error))
-            return str(error)
+            goes_on = "; the tracker goes on with the settings that it had" if self._session is not None else ""
+            self._parts.refuse(f"{error}{goes_on}")
+            return f"{error}{goes_on}"
         self._parts.refusal, self._told = "", "the next frame shows the world"
         if world is not None:
             self._told = f"the world is {len(world.types)} known object{'s' * (len(world.types) != 1)}"
+        self._begun += 1
+        begun, self._places_world = self._begun, True
+        self._parts.worker.forget()  # an image that came without its pose must not place the new world
 
         def job() -> None:
             self._known, self._session = None, None
+            self._waited, self._has_pose = 0.0, False
             self._path.clear()
             self._parts.health.begin()
             try:
                 with self._parts.health.doing("loading the library"):
-                    self._session = _Session(self._make(library, settings, world), jax.default_backend())
+                    follower = self._make(library, settings, world)
+                backend = jax.default_backend()
+                self._session = _Session(follower, backend, begun, node.table_frame, world is not None)
             except Exception as error:
                 self._parts.refusal = self._parts.failure("cannot make the tracker", error)
                 self.get_logger().error(self._parts.refusal)
@@ -140,23 +155,41 @@ class CameraTrackerNode(Node):
             return
         try:
             frame = messages.frame()
+        except ValueError as error:
+            self._no_pose(str(error))
+            return
+        if self._known is None and not session.world_told and messages.pose.problem:
+            self._no_pose(f"no camera pose places the world in {session.table_frame!r}: {messages.pose.problem}")
+            return
+        began = time.monotonic()
+        try:
             with self._working(session.follower, frame):
-                known, estimate = session.follower.step(self._known, frame)
-        except (ValueError, TrackingError, ParseError) as error:
-            self._parts.problem(f"lost: {error}" if self._known is not None else str(error))
+                known, estimate = session.follower.step(self._known, frame, self._waited)
+        except (TrackingError, ParseError) as error:
+            self._no_pose(f"lost: {error}" if self._known is not None else str(error))
             return
+        now = time.monotonic()
         self._known = known
+        self._waited = now - began if estimate.found_again else 0.0
+        if self._begun == session.begun:  # else this tracker's time is over
+            self._places_world = False
         if estimate.lost:
-            self._parts.problem(f"lost: {estimate.lost}")
+            self._no_pose(f"lost: {estimate.lost}")
             return
-        settings = self._node_settings()
-        world = settings.table_frame
+        self._has_pose = True
+        settings, world = self._node_settings(), session.table_frame
         self._pose.publish(camera_pose_message(estimate, world))
         self._particles.publish(camera_particles(estimate, world, settings.most_particles))
         self._path.add(estimate, world)
         if self._trail.get_subscription_count():  # grows with every frame
             self._trail.publish(self._path.message())
-        self._parts.health.output(estimate.seconds, [estimate.ess], time.monotonic() - messages.arrived)
+        notes = ("the camera was searched for in the whole of the last image",) if estimate.found_again else ()
+        self._parts.health.output(now - began, [estimate.ess], time.monotonic() - messages.arrived, notes=notes)
+
+    def _no_pose(self, why: str) -> None:
+        """A frame that gave none."""
+        self._has_pose = False
+        self._parts.problem(why)
 
     def _working(self, follower: Follower, frame: DepthFrame) -> contextlib.AbstractContextManager[None]:
         """What the node does meanwhile, for diagnostics."""
@@ -173,7 +206,7 @@ class CameraTrackerNode(Node):
 
     def _listen(self) -> None:
         # Only the first frame is placed by a pose; later ones need not wait for theirs.
-        self._parts.listen(self._parts.worker.submit, wants_pose=lambda: self._known is None)
+        self._parts.listen(self._parts.worker.submit, wants_pose=lambda: self._places_world)
 
     def _parameters_changed(self, names: set[str]) -> None:
         if names & DEPTH_INPUT_PARAMETERS:
@@ -191,7 +224,7 @@ class CameraTrackerNode(Node):
         told = (ERROR, self._parts.refusal) if self._parts.refusal else self._parts.judge(view, good="tracking")
         session = self._session
         self._parts.health.backend = session.backend if session else ""
-        state = "tracking" if told[0] == OK else "waiting" if self._known is None else "lost"
+        state = "waiting" if self._known is None else "tracking" if self._has_pose else "lost"
         return self._parts.health_report("camera tracking", told, state, view)
 
 

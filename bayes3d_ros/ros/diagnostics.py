@@ -132,6 +132,7 @@ class Health:
         self._doing: tuple[str, float, float] | None = None
         self._latency, self._seconds, self._ess = 0.0, 0.0, ""
         self._warnings: tuple[str, ...] = ()
+        self._notes: tuple[str, ...] = ()
         self._usable_share = math.nan
         self._unusable, self._looked_at = "", -math.inf
         self.parsed, self.refused, self.discarded, self.unasked = 0, 0, 0, 0
@@ -142,7 +143,7 @@ class Health:
         with self._lock:
             self._outputs.clear()
             self._began = time.monotonic()
-            self._problem, self._problem_at, self._warnings = "", -math.inf, ()
+            self._problem, self._problem_at, self._warnings, self._notes = "", -math.inf, (), ()
             self._unusable, self._looked_at = "", -math.inf
 
     def problem(self, text: str, kind: str = "") -> bool:
@@ -181,14 +182,16 @@ class Health:
         latency: float,
         warnings: Sequence[str] = (),
         usable_share: float = math.nan,
+        notes: Sequence[str] = (),
     ) -> None:
         """Note an output: the seconds that inference took, effective shares of the particles, how many seconds after
-        its image it came, what a user should be warned of, and the share of the pixels on the table that were used."""
+        its image it came, what a user should be warned of, the share of the pixels on the table that were used, and
+        what a user should know though nothing is wrong."""
         with self._lock:
             self.parsed += 1
             self._outputs.append(time.monotonic())
             self._latency, self._seconds, self._usable_share = latency, seconds, usable_share
-            self._warnings = tuple(warnings)
+            self._warnings, self._notes = tuple(warnings), tuple(notes)
             self._ess = " ".join(f"{share:.2f}" for share in ess)
 
     @contextmanager
@@ -257,7 +260,9 @@ class Health:
                 backend=self.backend,
                 ess=self._ess,
                 last_problem=self._problem,
-                notes="" if view is None else "; ".join([*input_warnings(view), *input_notes(view), *self._warnings]),
+                notes=""
+                if view is None
+                else "; ".join([*input_warnings(view), *input_notes(view), *self._warnings, *self._notes]),
             )
         return diagnostic_array(status)
 

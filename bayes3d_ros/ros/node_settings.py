@@ -151,7 +151,9 @@ class CameraTrackerNodeSettings(DepthInputSettings):
     """What the camera_tracker node needs beside the tracker's own settings."""
 
     library: str = setting(
-        "", "folder of object models, made by bayes3d import or learn; read when the node starts and on ~/reset"
+        "",
+        "folder of object models, made by bayes3d import or learn; read when the node starts, when this is set, and on "
+        "~/reset",
     )
     world: str = setting(
         "", "yaml file of known objects and their poses in table_frame; empty: the objects that the first image shows"

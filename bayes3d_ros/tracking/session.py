@@ -13,14 +13,20 @@ from bayes3d_ros.likelihood.backends import likelihood_here
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.parsing.parser import SceneParser
 from bayes3d_ros.posterior.types import ParseError, ScenePosterior
-from bayes3d_ros.settings import ParserSettings
-from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError
+from bayes3d_ros.settings import ParserSettings, TrackerSettings
+from bayes3d_ros.tracking.camera_estimate import CameraEstimate, KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.tracker import CameraTracker, Tracking
 
+# Seconds of a search for which a live camera is followed, and not searched for again. Ten objects take less; a search
+# that compiles takes minutes, after which the camera may be anywhere.
+LONGEST_SEARCH = 10.0
 
-def parser_of_worlds(library: Library) -> SceneParser:
-    """The parser that finds the world in a first frame, and a camera that is lost."""
-    return SceneParser(library, ParserSettings(likelihood=likelihood_here()))
+
+def parser_of_worlds(library: Library, settings: TrackerSettings) -> SceneParser:
+    """The parser that finds the world in a first frame, and a camera that is lost; with the tracker's settings where it
+    has the same ones."""
+    shared = {name: getattr(settings, name) for name in ("near", "far", "sigma_max", "seed")}
+    return SceneParser(library, ParserSettings(likelihood=likelihood_here(), **shared))
 
 
 class CameraFollower:
@@ -29,7 +35,10 @@ class CameraFollower:
     help."""
 
     def __init__(self, tracker: CameraTracker, parser: SceneParser, world: KnownWorld | None = None) -> None:
-        """Raises WorldError for a world without objects, or with ones that the library lacks."""
+        """Raises WorldError for a world without objects, or with ones that the library lacks, or where none is told and
+        the tracker's setting `table` is false: a first frame is parsed by its table."""
+        if world is None and not tracker.settings.table:
+            raise WorldError("table is false: expected a world file, as a first frame is parsed by its table")
         self.tracker, self.parser = tracker, parser
         self._told = None if world is None else tracker.start(world, np.eye(4))
 
@@ -42,13 +51,14 @@ class CameraFollower:
         parsed = world is not None or self.parser.compiled_for(width, height)
         return parsed and self.tracker.compiled_for(width, height, objects)
 
-    def step(self, known: Tracking | None, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
+    def step(self, known: Tracking | None, frame: DepthFrame, waited: float = 0.0) -> tuple[Tracking, CameraEstimate]:
         """One frame, the first one where nothing is known yet. Where stamps jump, back (a bag that loops, a clock that
-        was set back) or far ahead, the camera is found again. Raises TrackingError or ParseError, and then what was
-        known still is."""
+        was set back) or far ahead, the camera is found again. waited: seconds since the last frame in which the caller
+        took none, as a search kept it busy; a live camera's stamps go on meanwhile, and are no jump. Raises
+        TrackingError or ParseError, and then what was known still is."""
         if known is None:
             return self._first(frame)
-        if self._follows(known, frame):
+        if self._follows(known, frame, waited):
             now, estimate = self.tracker.step(known, frame)
             if not estimate.lost:
                 return now, estimate
@@ -63,11 +73,12 @@ class CameraFollower:
             return self._looked_for(known, frame)
         return now, replace(estimate, found_again=True)
 
-    def _follows(self, known: Tracking, frame: DepthFrame) -> bool:
+    def _follows(self, known: Tracking, frame: DepthFrame, waited: float) -> bool:
         """Whether the frame is so soon after the last one that the camera's motion tells where it is."""
         if known.stamp_ns is None:
             return True
-        return 0 < 1e-9 * (frame.stamp_ns - known.stamp_ns) <= self.tracker.settings.longest_gap
+        longest = self.tracker.settings.longest_gap + min(waited, LONGEST_SEARCH)
+        return 0 < 1e-9 * (frame.stamp_ns - known.stamp_ns) <= longest
 
     def _first(self, frame: DepthFrame) -> tuple[Tracking, CameraEstimate]:
         if self._told is None:
@@ -75,6 +86,8 @@ class CameraFollower:
             self.parser.warm_up(width, height)  # or frames that show nothing would leave part of it to a later one
             world, T_world_camera = world_of(self.parser.parse(frame), self.tracker.settings.table)
             now, estimate = self.tracker.step(self.tracker.start(world, T_world_camera), frame)
+            if estimate.lost:  # a camera that is lost in it from the start has no use for this world
+                raise TrackingError(estimate.lost)
             return now, replace(estimate, found_again=True)
         if frame.T_table_camera is not None:
             now, estimate = self.tracker.step(self.tracker.start(self._told.world, frame.T_table_camera), frame)

@@ -150,15 +150,20 @@ class CameraTracker:
             seconds=time.perf_counter() - began,
         )
         self._compiled.add((image.depth.shape, len(known.world.types)))
+        if known.stamp_ns is None:  # the start pose was off by this much: that is no velocity
+            particles = particles._replace(motion=_no_motion(particles.motion))
         now = replace(known, particles=particles, stamp_ns=frame.stamp_ns, frame_time=seconds)
         return now, replace(estimate, lost=self._why_lost(estimate))
 
     def _why_lost(self, estimate: CameraEstimate) -> str:
         if estimate.in_sight < OUT_OF_SIGHT:
-            return f"the world's objects are out of sight ({estimate.in_sight} pixels)"
+            return (
+                f"the world's objects are out of sight ({estimate.in_sight} pixels of an image that is "
+                f"{self.settings.score_width} wide, expected {OUT_OF_SIGHT}; score_width)"
+            )
         if estimate.explained < self.settings.least_explained:
             return f"only {estimate.explained:.0%} of the objects' {estimate.in_sight} pixels are where they should be"
-        if estimate.log_evidence <= 0:
+        if not estimate.log_evidence > 0:  # also where it is NaN
             return f"the image is explained better by nothing in sight (log evidence {estimate.log_evidence:.0f})"
         return ""
 
@@ -169,7 +174,7 @@ class CameraTracker:
         if not suggested:
             seen = ", ".join(o.type for o in posterior.objects) or "no object"
             raise TrackingError(f"expected one of {', '.join(sorted(set(known.world.types)))} in sight, found {seen}")
-        image = self._image(frame, known.world, np.linalg.inv(suggested[0]))
+        image = self._image(frame, known.world, None)  # an object may have been moved: no pose tells what to leave out
         found = likeliest(np.stack(suggested), known.scene, image, self.settings.window, self._devices)
         return self._begun_anew(known, found)
 
@@ -241,6 +246,12 @@ def _suggested(world: KnownWorld, posterior: ScenePosterior) -> Iterator[Float[n
             if name == found.type:
                 for position, orientation in poses:
                     yield T_world_object @ np.linalg.inv(pose_matrix(position, orientation))
+
+
+@jax.jit
+def _no_motion(motion: Float[Array, "N 4 4"]) -> Float[Array, "N 4 4"]:
+    """On the same devices."""
+    return jnp.eye(4) + 0 * motion
 
 
 @jax.jit

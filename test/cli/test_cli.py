@@ -561,8 +561,15 @@ def test_track_writes_a_line_a_frame_and_a_picture(bag, library, followers, tmp_
     assert around == "following the camera around what its first frame shows"
     assert beginning == "first frame: compiling, some minutes the first time ..."
     assert ready.startswith("first frame: compiling, some minutes the first time: ready after ")
-    assert "lost: out of sight" in result.stdout and "3 frames tracked, lost in 1" in result.stdout
+    assert "lost: out of sight" in result.stdout and "2 frames tracked, lost in 1" in result.stdout
     assert (out / "track.png").stat().st_size > 10_000
+
+
+def test_track_fails_where_the_camera_is_lost_in_every_frame(bag, library, followers, tmp_path):
+    followers.lost.update((1, 2, 3))
+    result = run("track", bag, "--library", library, "--out", tmp_path / "out")
+    assert result.exit_code == 1 and "its camera is lost in every frame: out of sight" in result.stderr
+    assert "0 frames tracked, lost in 3" in result.stdout and (tmp_path / "out" / "cameras.jsonl").exists()
 
 
 def test_track_around_a_known_world(bag, library, followers, tmp_path):

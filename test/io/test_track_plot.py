@@ -81,6 +81,10 @@ def test_lost_frames_are_shaded_and_told(tmp_path, monkeypatch, panels):
     plot_track(tracked, tmp_path / "a.png", "title")
     assert spans == [pytest.approx((0.15, 0.25))] * 3
     assert track_verdict(tracked) == (False, "Lost in 1 of 5 frames (red); first, frame 3: out of sight")
+    assert track_verdict(estimates(5), failed=2) == (
+        False,
+        "Tracked in 5 frames; 2 other frames could not be tracked at all",
+    )
     told = track_verdict(estimates(5))
     assert told.healthy and told.words.endswith("median standard deviations 3.7 mm, 0.50 degrees")
     path = panels[-1][0].lines[0].get_xdata()

@@ -14,8 +14,8 @@ from bayes3d_ros.tracking.camera_estimate import CameraEstimate, TrackingError
 
 
 class FakeFollower:
-    """The camera stands as high above the world as the first return is far, and as far along y as the first known
-    object."""
+    """The camera stands as high above the world as the first return is far, as far along y as the first known object,
+    and a metre along x where the node says that a search kept it busy. The first frame is searched."""
 
     def __init__(self, library, settings, world):
         self.y = 0.0 if world is None else world.T_world_object[0, 1, 3]
@@ -23,12 +23,12 @@ class FakeFollower:
     def compiled_for(self, width, height, known):
         return True
 
-    def step(self, known, frame):
+    def step(self, known, frame, waited):
         depth = frame.depth[np.isfinite(frame.depth)]
         if not depth.size:
             raise TrackingError("the depth image has no return")
         T = np.diag([1.0, -1.0, -1.0, 1.0])
-        T[1:3, 3] = self.y, depth[0]
+        T[:3, 3] = float(waited > 0), self.y, depth[0]
         particles = np.repeat(T[None], 4, 0)
         particles[:, 0, 3] = np.arange(4)
         estimate = CameraEstimate(
@@ -45,6 +45,7 @@ class FakeFollower:
             p_outlier=0.05,
             sigma=0.002,
             seconds=0.01,
+            found_again=known is None,
         )
         lost = "only 10% of the objects' 100 pixels are where they should be" if depth[0] < 0.5 else ""
         return SimpleNamespace(), replace(estimate, lost=lost)

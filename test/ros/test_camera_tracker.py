@@ -10,6 +10,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bayes3d_ros.ros.from_messages import stamp_to_ns
@@ -36,6 +38,12 @@ def rig(ros, library_folder, depth_frame):
             ros.start(here, "--ros-args", *words)
             self.camera.wait_for_subscriber()
 
+        def set(self, **values):
+            parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+            request = SetParameters.Request(parameters=parameters)
+            answer = ros.call(SetParameters, "/camera_tracker/set_parameters", request)
+            assert all(result.successful for result in answer.results), answer
+
         def show(self, stamp, depth):
             frame = depth_frame(stamp)
             self.camera.publish(replace(frame, depth=np.full_like(frame.depth, depth)))
@@ -61,6 +69,8 @@ def test_poses_particles_and_path(rig):
     report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
     values = {pair.key: pair.value for pair in report.status[0].values}
     assert values["parsed"] == "3" and values["ess"] == "0.50" and values["state"] == "tracking"
+    # The frame after a search is told how long that took: a live camera's stamps go on meanwhile.
+    assert [p.pose.pose.position.x for p in rig.poses] == [0.0, 1.0, 0.0]
 
 
 def test_a_lost_camera_has_no_pose_and_says_why(rig):
@@ -81,18 +91,82 @@ def test_a_lost_camera_has_no_pose_and_says_why(rig):
     rig.ros.wait_for(lambda: rig.paths[-1].poses and len(rig.paths[-1].poses) == 1, "a path that begins anew")
 
 
-def test_only_the_first_frame_waits_for_a_camera_pose(rig):
-    silent = rig.ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
+@pytest.fixture
+def placed(rig):
+    """placed(stamp_ns): send a pose on a topic that the node, which is started here, knows to have a publisher."""
+    publisher = rig.ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
     rig.start(patience=1.0)
-    rig.ros.wait_for(silent.get_subscription_count, "a subscriber of the pose")
+    rig.ros.wait_for(publisher.get_subscription_count, "a subscriber of the pose")
     rig.ros.wait_for_diagnosis(rig.diagnostics, "no message", TRACKER)
     rig.ros.spin_until(time.monotonic() + 1.0)  # the node has looked who publishes
-    for k, slow in ((1, True), (2, False)):
-        rig.show(k * 10**9, 1.0)
-        rig.ros.wait_for(lambda k=k: len(rig.poses) == k, f"pose {k}")
-        report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
-        latency = {pair.key: pair.value for pair in report.status[0].values}["latency s"]
-        assert (float(latency) > 0.9) == slow
+
+    def send(stamp_ns):
+        pose = PoseStamped()
+        pose.header.frame_id, pose.header.stamp.sec = "bench", stamp_ns // 10**9
+        pose.pose.position.z, pose.pose.orientation.x, pose.pose.orientation.w = 1.0, 1.0, 0.0
+        publisher.publish(pose)
+
+    return send
+
+
+def latency(rig):
+    report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
+    return float({pair.key: pair.value for pair in report.status[0].values}["latency s"])
+
+
+def test_only_the_first_frame_waits_for_a_camera_pose(rig, placed):
+    rig.show(10**9, 1.0)
+    rig.ros.spin_until(time.monotonic() + 0.4)
+    assert not rig.poses
+    placed(10**9)
+    rig.ros.wait_for(lambda: len(rig.poses) == 1, "the first pose")
+    assert latency(rig) > 0.4
+    rig.show(2 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: len(rig.poses) == 2, "a second pose")
+    assert latency(rig) < 0.4
+
+
+def test_a_first_frame_whose_camera_pose_is_missing_places_no_world(rig, placed):
+    """Else the plane in one image would be called the table's frame for good."""
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "no camera pose places the world in 'bench': /camera_pose: no", TRACKER)
+    assert not rig.poses
+    placed(2 * 10**9)
+    rig.show(2 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose in the world that the second frame places")
+    assert stamp_to_ns(rig.poses[0].header.stamp) == 2 * 10**9
+
+
+def test_after_a_reset_the_next_frame_waits_for_a_camera_pose_again(rig, placed):
+    placed(10**9)
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose")
+    assert rig.ros.call(Trigger, "/camera_tracker/reset", Trigger.Request()).success
+    rig.show(2 * 10**9, 1.0)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "no camera pose places the world in 'bench'", TRACKER)
+    assert len(rig.poses) == 1
+
+
+def test_a_parameter_begins_anew_and_its_frame_goes_with_it(rig):
+    rig.start()
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.paths, "a path")
+    rig.set(table_frame="desk")
+    rig.show(2 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: len(rig.poses) == 2, "a pose in the new frame")
+    assert rig.poses[-1].header.frame_id == "desk" and rig.poses[-1].pose.pose.position.x == 0.0  # searched anew
+    rig.ros.wait_for(lambda: rig.paths[-1].header.frame_id == "desk", "a path in the new frame")
+    assert len(rig.paths[-1].poses) == 1
+
+
+def test_a_refused_parameter_leaves_the_tracker_as_it_was(rig):
+    rig.start()
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose")
+    rig.set(world="/nowhere.yaml")
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "; the tracker goes on with the settings that it had", TRACKER)
+    rig.show(2 * 10**9, 1.0)
+    rig.ros.wait_for(lambda: len(rig.poses) == 2, "a pose")
 
 
 def test_a_known_world_goes_to_the_tracker(rig, library_folder, tmp_path):

@@ -25,9 +25,9 @@ from bayes3d_ros.settings import TrackerSettings
 from bayes3d_ros.tracking import marginal_filter
 from bayes3d_ros.tracking import tracker as module
 from bayes3d_ros.tracking.camera_errors import SmoothError, pose_covariance
-from bayes3d_ros.tracking.camera_estimate import KnownWorld, TrackingError
+from bayes3d_ros.tracking.camera_estimate import KnownWorld, TrackingError, WorldError
 from bayes3d_ros.tracking.relocalise import LookAt, over_table
-from bayes3d_ros.tracking.session import CameraFollower
+from bayes3d_ros.tracking.session import CameraFollower, parser_of_worlds
 from bayes3d_ros.tracking.tracker import CameraTracker
 
 CAMERA = Intrinsics(32.0, 32.0, 15.5, 11.5, 32, 24)
@@ -160,6 +160,64 @@ def test_after_a_jump_of_stamps_the_camera_is_looked_for(tracker, world, frame, 
     assert not estimate.found_again and not estimate.lost
 
 
+def test_after_a_long_search_a_live_camera_is_followed(tracker, world, frame):
+    """Its stamps went on while the first frame was parsed, here for a second and a half."""
+    there, calls = looking(0.3), []
+
+    def parse(seen):
+        calls.append(seen.stamp_ns)
+        return parsed(world, there, seen)
+
+    follower = CameraFollower(tracker, parser_that(parse))
+    known, _ = follower.step(None, frame(0, there))
+    later = frame(round(1.5e9 / STEP), there)
+    assert follower.step(known, later)[1].found_again and len(calls) == 2
+    _, estimate = follower.step(known, later, waited=1.5)
+    assert not estimate.found_again and not estimate.lost and len(calls) == 2
+    assert np.abs(off(estimate, there)[:3]).max() < 0.006
+    assert follower.step(known, frame(round(60e9 / STEP), there), waited=300.0)[1].found_again  # it was compiled
+
+
+def test_the_start_poses_error_is_no_velocity(tracker, world, frame):
+    """A camera at rest whose first pose was 8 mm and a degree off, and that sends its second image a second later."""
+    there = looking(0.3)
+    start = there.copy()
+    start[:3, :3] = there[:3, :3] @ Rotation.from_euler("x", 1.0, degrees=True).as_matrix()
+    start[:3, 3] += [0.008, 0.0, 0.0]
+    known, _ = tracker.step(tracker.start(world, start), frame(0, there))
+    np.testing.assert_array_equal(known.particles.motion, np.broadcast_to(np.eye(4), known.particles.motion.shape))
+    known, estimate = tracker.step(known, frame(round(1e9 / STEP), there))
+    assert not estimate.lost and np.abs(off(estimate, there)[:3]).max() < 0.006
+    assert np.abs(np.asarray(known.particles.motion) - np.eye(4)).max() > 0  # of the second frame it is
+
+
+def test_a_world_in_which_the_camera_is_lost_at_once_is_none(tracker, world, frame):
+    there = looking(0.3)
+    follower = CameraFollower(tracker, parser_that(lambda seen: parsed(world, there, seen)))
+    with pytest.raises(TrackingError, match="pixels are where they should be"):
+        follower.step(None, frame(0, there, objects=False))
+
+
+def test_a_moved_object_does_not_hide_those_at_rest(tracker, world, frame):
+    """The first of three is not where it was known to be. What returns from the others must count, though the pose that
+    puts the first in its place has them elsewhere."""
+    there = looking(0.3, 0.8)
+    known = np.repeat(world.T_world_object, 3, 0)
+    known[:, :2, 3] += [[-0.25, 0.0], [0.1, 0.12], [0.1, -0.12]]
+    seen = known.copy()
+    seen[0, :2, 3] += [0.0, 0.25]
+    scene = World(jnp.array([0, 0, 0]), jnp.asarray(seen, jnp.float32), jnp.asarray(True))
+    rays = tuple(jnp.asarray(CAMERA.rays()[..., k]) for k in (0, 1))
+    depth = _render(jnp.asarray(np.linalg.inv(there), jnp.float32), scene, tracker._arrays, rays)
+    image = frame(0, there)
+    image = replace(image, depth=np.where(np.isfinite(depth), depth, np.nan).astype(np.float32))
+    three = ("thing",) * 3
+    posterior = parsed(KnownWorld(three, seen, True), there, image)
+    found = tracker.find_by_parsed_scene(tracker.start(KnownWorld(three, known, True), there), posterior, image)
+    T = np.linalg.inv(np.asarray(marginal_filter.expected_pose(found.particles), np.float64))
+    np.testing.assert_allclose(T, there, atol=1e-4)
+
+
 @pytest.mark.parametrize("azimuth", [0.4, 2.5, 4.4])
 def test_in_a_known_world_the_camera_is_looked_for_all_around(tracker, world, frame, azimuth):
     """Without a parser or a recorded pose; it looks a little past the objects, as no draw of the prior does."""
@@ -206,6 +264,18 @@ def test_a_lost_camera_is_looked_for_where_parsing_does_not_help(tracker, world,
             alone.step(known, frame(100, there))
     else:
         assert alone.step(known, frame(100, there))[1].lost
+
+
+def test_without_a_table_a_world_must_be_told(tracker):
+    tableless = CameraTracker(tracker.library, replace(tracker.settings, table=False))
+    with pytest.raises(WorldError, match="table is false: expected a world file"):
+        CameraFollower(tableless, parser_that(None))
+
+
+def test_the_parser_of_worlds_has_the_trackers_settings(tracker):
+    settings = TrackerSettings(near=0.2, far=1.5, sigma_max=0.006, seed=7)
+    parser = parser_of_worlds(tracker.library, settings)
+    assert [getattr(parser.settings, name) for name in ("near", "far", "sigma_max", "seed")] == [0.2, 1.5, 0.006, 7]
 
 
 def test_draws_of_the_look_at_prior():
