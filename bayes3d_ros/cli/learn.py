@@ -3,8 +3,9 @@
 """`bayes3d learn`: a model of an object from views of it."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,6 +22,10 @@ from bayes3d_ros.cli.options import (
 )
 from bayes3d_ros.cli.progress import progress
 from bayes3d_ros.settings import LearnerSettings
+
+if TYPE_CHECKING:  # --help must be quick
+    from bayes3d_ros.geometry.depth_frame import DepthFrame
+    from bayes3d_ros.io.bags import BagDamage, FrameReader
 
 
 @click.command(cls=CommandWithSettings, kind=LearnerSettings)
@@ -86,12 +91,13 @@ def learn(
         options |= {"at_x": at[0], "at_y": at[1]}
     settings = settings_from(LearnerSettings, more, options)
     reader = read_frames(bag, topic, table_frame)
-    poses = [frame.T_table_camera for frame in progress(reader, len(reader), "frame")]
+    readable = _Readable(reader)
+    poses = [frame.T_table_camera for frame in progress(readable, len(reader), "frame")]
     chosen = set(spread_views(poses, views))
     if not chosen:
         lacking = f"none of its {len(poses)} frames has a camera_pose (PoseStamped) of its stamp, or one of tf"
         raise InputError(f"{bag}: {reader.depth_topic}: {lacking} ({reader.pose_told})")
-    frames = [frame for k, frame in enumerate(reader) if k in chosen]
+    frames = [frame for k, frame in enumerate(readable) if k in chosen]
     learned = learn_model(frames, name, settings)
     for number, view in enumerate(learned.views, 1):
         told = view.refused or (
@@ -107,3 +113,21 @@ def learn(
     click.echo(f"{save_model(model, library, replace=replace)}")
     title = f"learned from {bag.name}; red: seen in no view"
     click.echo(f"{plot_model(model, library / f'{name}.png', title, verdict)}")
+    if readable.damage is not None:
+        raise readable.damage
+
+
+class _Readable:
+    """The frames of a bag that can be read. What was lost is told when the model is made."""
+
+    def __init__(self, frames: "FrameReader") -> None:
+        self._frames = frames
+        self.damage: "BagDamage | None" = None
+
+    def __iter__(self) -> Iterator["DepthFrame"]:
+        from bayes3d_ros.io.bags import BagDamage as Damage
+
+        try:
+            yield from self._frames
+        except Damage as error:  # raised after the last frame
+            self.damage = error

@@ -119,6 +119,7 @@ def _cloud(surface: Surface) -> _Cloud:
     tree = cKDTree(surface.points)
     neighbours, share = RIM
     distance, index = tree.query(surface.points, min(neighbours, len(surface.points)), workers=-1)
+    distance, index = (a.reshape(len(surface.points), -1) for a in (distance, index))  # 1-d of a single point
     off = np.linalg.norm(surface.points[index].mean(1) - surface.points, axis=1)
     return _Cloud(surface, tree, off > share * distance.mean(1), some)
 

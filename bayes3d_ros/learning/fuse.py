@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
@@ -70,6 +70,8 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
     passes, glimpses = rays.reshape(2, *grid.shape)
+    if not (hits > 0).any():
+        raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
     surface = _pieces((hits > 0) & (HIT * hits - GLIMPSE * glimpses - (PASS - GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
@@ -165,11 +167,11 @@ def _noise_of_a_neighbour(patches: Patches, grid: FusionGrid) -> Bool[np.ndarray
 
 
 def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
-    """Convex hull of the surface and of what it stands on."""
+    """Convex hull of the surface and of what it stands on. Raises FusionError for points that have no volume."""
     feet = points[points[:, 2] < points[:, 2].min() + FOOT] * [1, 1, 0]
     try:
         return ConvexHull(np.concatenate([points, feet]))
-    except ValueError as error:  # QhullError is one
+    except (QhullError, ValueError) as error:
         raise FusionError(f"the points seen have no volume ({str(error).splitlines()[0][:80]})") from None
 
 

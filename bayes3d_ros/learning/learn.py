@@ -16,17 +16,19 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved, residual_between
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
-from bayes3d_ros.learning.fusion_constants import CONTRADICTED, SEEN_THROUGH
+from bayes3d_ros.learning.fusion_constants import CONTRADICTED, PLACE_ERROR, SEEN_THROUGH
 from bayes3d_ros.learning.segment import (
     Surface,
     Thing,
     View,
     ViewError,
+    check_pixels,
     middle,
     places_of,
     segment,
     surface,
     thing_at,
+    thing_beside,
 )
 from bayes3d_ros.objects.mesh_import import contact_normals
 from bayes3d_ros.objects.model import NAME_PATTERN, ObjectModel, is_reserved
@@ -48,7 +50,7 @@ class ViewReport:
     shift: float  # metres by which its pose was corrected, at the object
     turn: float  # radians
     refused: str = ""  # why nothing of it is in the model
-    cut_off: bool = False  # whether the object reaches the border of the image
+    cut_off: str = ""  # what the object reaches and may go on beyond: the image's border or a setting; empty: nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +71,13 @@ class Learned:
         one = (
             "learned from one view: the side that it hides is unknown, and closed by the convex hull of what was seen",
         )
-        cut = [f"view {k}" for k, view in used.items() if view.cut_off]
-        beyond = (f"the border of the image cuts the object off in {', '.join(cut)}: what is beyond is not seen",)
-        return (*(one if len(used) == 1 else ()), *(beyond if cut else ()))
+        limits = sorted({view.cut_off for view in used.values() if view.cut_off})
+        views_at = {limit: [f"view {k}" for k, view in used.items() if view.cut_off == limit] for limit in limits}
+        beyond = (
+            f"{limit} cuts the object off in {', '.join(views)}: what is beyond is not seen"
+            for limit, views in views_at.items()
+        )
+        return (*(one if len(used) == 1 else ()), *beyond)
 
 
 def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | None = None) -> Learned:
@@ -145,7 +151,7 @@ def spread_views(poses: Sequence[Float[np.ndarray, "4 4"] | None], most: int) ->
         return there
     places = np.array([pose[:3, 3] for pose in poses if pose is not None])
     chosen = farthest_first(0, most, lambda k: np.linalg.norm(places - places[k], axis=1))
-    return sorted(there[k] for k in chosen)
+    return sorted({there[k] for k in chosen})  # of a camera that stands still one
 
 
 def choose_things(views: dict[int, View], settings: LearnerSettings) -> tuple[dict[int, Thing], dict[int, str]]:
@@ -160,33 +166,36 @@ def choose_things(views: dict[int, View], settings: LearnerSettings) -> tuple[di
             missing[k] = str(error)
     if missing and not chosen:  # one line: the others say the same
         others = len(missing) - 1
-        raise LearningError(next(iter(missing.values())) + (f"; nor in {others} other views" * (others > 0)))
+        more = f"; nor in {others} other view{'s' * (others != 1)}" if others else ""
+        raise LearningError(next(iter(missing.values())) + more)
     return chosen, missing
 
 
 def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings) -> Thing:
     """The thing to learn of those in a view, given what was chosen in the views before.
 
-    With a place (`at_x`, `at_y`) it is in every view the thing nearest to that place (`thing_at`); ViewError where
-    there is none. Without one it is in the first view as `cluster` says, and in the others the one whose middle is
-    nearest to what was chosen before; LearningError where there are several to begin with and `cluster` is "only".
+    With a place (`at_x`, `at_y`) it is in every view the thing nearest to that place (`thing_at`). Without one it is in
+    the first view as `cluster` says, and in the others the one that was chosen before (`thing_beside`). Raises
+    ViewError where it is not there, where `cluster` is "only" and there are several to begin with, and where the view's
+    pixels are too far apart for the voxels.
     """
+    within = settings.max_shift + PLACE_ERROR
     if settings.place is not None:
-        return thing_at(view, settings.place)
-    if before:
-        return _nearest(view.things, np.mean([middle(thing.points) for thing in before], 0))
-    if settings.cluster == "central":
-        return _nearest(view.things, np.array([settings.workspace_x, settings.workspace_y]))
-    if settings.cluster == "only" and len(view.things) > 1:
-        raise LearningError(
+        chosen = thing_at(view, settings.place, within)
+    elif before:
+        chosen = thing_beside(view, before, within)
+    elif settings.cluster == "central":
+        centre = np.array([settings.workspace_x, settings.workspace_y])
+        chosen = min(view.things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - centre)))
+    elif settings.cluster == "only" and len(view.things) > 1:
+        raise ViewError(
             f"{places_of(view.things)}: expected one, or the place of the one to learn (at_x, at_y; --at X Y), "
             "or cluster largest or central, or a smaller workspace"
         )
-    return view.things[0]
-
-
-def _nearest(things: Sequence[Thing], place: Float[np.ndarray, "2"]) -> Thing:
-    return min(things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - place)))
+    else:
+        chosen = view.things[0]
+    check_pixels(view, chosen, settings.voxel_size)
+    return chosen
 
 
 def new_share(thing: Thing, before: Sequence[Thing], voxel_size: float) -> float:

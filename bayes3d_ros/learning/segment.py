@@ -2,6 +2,7 @@
 
 """What one calibrated depth view shows of things on the table: their surface points, in the table frame."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,15 +13,17 @@ from scipy import ndimage
 from bayes3d_ros.geometry.camera import unproject
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.learning.fusion_constants import (
-    AT_WITHIN,
+    CUT_WITHIN,
     EDGE_SHARE,
     FEWEST_PIXELS,
     FIRM,
     FOOT_WITHIN,
     LOWEST,
     NORMAL_RADIUS,
+    PIXELS_A_VOXEL,
     SWELL,
-    TABLE_WITHIN,
+    TABLE_AREA,
+    TABLE_BEYOND,
 )
 from bayes3d_ros.learning.tuning import TUNING
 from bayes3d_ros.parsing.support_plane import Plane, find_plane
@@ -37,7 +40,7 @@ class Thing(NamedTuple):
 
     points: Float[np.ndarray, "N 3"]  # table frame
     pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]  # rows, columns
-    cut_off: bool  # whether it reaches the border of the image, so that a part of it may be outside
+    cut_off: str  # what it reaches, so that a part of it may be beyond: the image's border or a setting; empty: nothing
 
 
 class Surface(NamedTuple):
@@ -69,7 +72,7 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
     T_table_camera = _on_its_table(points, frame.T_table_camera, settings)
     local = points @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
     with np.errstate(invalid="ignore"):
-        inside = _inside(local, settings) & (local[..., 2] < settings.workspace_height)
+        inside = _inside(local[..., :2], settings) & (local[..., 2] < settings.workspace_height)
         flat = inside & (np.abs(local[..., 2]) < LOWEST[1])
     spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
     lowest = float(np.clip(3 * spread, *LOWEST))
@@ -87,13 +90,49 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
             f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
             f"{1e3 * lowest:.0f} mm above it, expected at least {FEWEST_PIXELS} together)"
         )
+    left_out = _left_out(frame, T_table_camera, lowest, settings)
     pixels = [np.nonzero(labels == k) for k in found]
-    return View(frame, T_table_camera, tuple(_thing(local, where) for where in pixels))
+    return View(frame, T_table_camera, tuple(Thing(local[at], at, _cut_by(at, depth, left_out)) for at in pixels))
 
 
-def _thing(local: Float[np.ndarray, "H W 3"], pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]) -> Thing:
-    on_border = any((at == 0).any() or (at == size - 1).any() for at, size in zip(pixels, local.shape[:2], strict=True))
-    return Thing(local[pixels], pixels, on_border)
+class _LeftOut(NamedTuple):
+    """Returns above the table that the settings leave out."""
+
+    depth: Float[np.ndarray, "H W"]  # NaN elsewhere
+    by: tuple[tuple[str, Bool[np.ndarray, "H W"]], ...]  # which settings, in words, leave out which
+
+
+def _left_out(
+    frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"], lowest: float, settings: LearnerSettings
+) -> _LeftOut:
+    depth = np.where(frame.depth > 0, frame.depth, np.nan)
+    local = unproject(depth, frame.intrinsics).astype(np.float64) @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
+    with np.errstate(invalid="ignore"):
+        above = np.isfinite(depth) & (local[..., 2] > lowest)
+        by = (
+            ("near or far", above & ((depth < settings.near) | (depth > settings.far))),
+            ("workspace_height", above & (local[..., 2] >= settings.workspace_height)),
+            ("the workspace", above & ~_inside(local[..., :2], settings)),
+        )
+    return _LeftOut(depth, by)
+
+
+def _cut_by(
+    pixels: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]], depth: Float[np.ndarray, "H W"], left_out: _LeftOut
+) -> str:
+    """What a thing reaches, see `Thing.cut_off`. A return that a setting leaves out is of the thing if it is beside it
+    and its depth is about the same."""
+    if any((at == 0).any() or (at == size - 1).any() for at, size in zip(pixels, depth.shape, strict=True)):
+        return "the border of the image"
+    low, high = (np.array([edge(at) for at in pixels]) for edge in (np.min, np.max))
+    part = tuple(slice(max(a - CUT_WITHIN, 0), b + CUT_WITHIN + 1) for a, b in zip(low, high, strict=True))
+    own = np.full(depth.shape, False)
+    own[pixels] = True
+    distance, nearest = ndimage.distance_transform_edt(~own[part], return_indices=True)
+    apart = np.abs(left_out.depth[part] - depth[part][tuple(nearest)])
+    with np.errstate(invalid="ignore"):
+        beside = (distance <= CUT_WITHIN) & (apart < EDGE_SHARE * left_out.depth[part])
+    return next((words for words, where in left_out.by if (beside & where[part]).any()), "")
 
 
 def surface(view: View, thing: Thing) -> Surface:
@@ -123,12 +162,12 @@ def surface(view: View, thing: Thing) -> Surface:
     return Surface(thing.points, np.where(away[:, None], -normals, normals))
 
 
-def thing_at(view: View, place: tuple[float, float]) -> Thing:
+def thing_at(view: View, place: tuple[float, float], within: float) -> Thing:
     """The thing nearest to a place on the table (x, y in the table frame, metres).
 
     How near a thing is: the distance in the table's plane (heights do not count) from the place to the nearest of the
     thing's returns in this view, so 0 for a place under what is seen of it. Raises ViewError, which names the place and
-    where things stand, if the nearest is farther than `AT_WITHIN`: then it is hidden in this view, or is not there.
+    where things stand, if the nearest is farther than `within` metres: then it is hidden in this view, or is not there.
 
     Things that touch, or stand closer to each other than the setting `gap`, are one thing here. Of a thing that the
     image's border cuts only the part inside is there (`Thing.cut_off`): the place has to be near that part.
@@ -139,13 +178,44 @@ def thing_at(view: View, place: tuple[float, float]) -> Thing:
     """
     distances = [float(np.hypot(*(thing.points[:, :2] - place).T).min()) for thing in view.things]
     nearest = int(np.argmin(distances))
-    if distances[nearest] > AT_WITHIN:
+    if distances[nearest] > within:
         x, y = place
         raise ViewError(
-            f"nothing stands within {1e3 * AT_WITHIN:.0f} mm of the place x {x:.2f} y {y:.2f} m (at_x, at_y; --at); "
+            f"nothing stands within {1e3 * within:.0f} mm of the place x {x:.2f} y {y:.2f} m (at_x, at_y; --at); "
             f"{places_of(view.things)}, the nearest {1e3 * distances[nearest]:.0f} mm away"
         )
     return view.things[nearest]
+
+
+def thing_beside(view: View, before: Sequence[Thing], within: float) -> Thing:
+    """The thing that was chosen in the views before: the one whose middle is nearest to theirs. Raises ViewError if it
+    is farther from them than they are wide and `within` metres: then it is another thing, and theirs is not in sight.
+
+    From opposite sides two views may show opposite sides of a thing, which are apart by its width.
+    """
+    place = np.mean([middle(thing.points) for thing in before], 0)
+    nearest = min(view.things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - place)))
+    seen = np.concatenate([thing.points[:, :2] for thing in before])
+    low, high, own = seen.min(0), seen.max(0), nearest.points[:, :2]
+    gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(own.min(0) - high, low - own.max(0)))))
+    if gap > max(*(high - low), *np.ptp(own, axis=0)) + within:
+        raise ViewError(
+            f"the thing to learn stands at x {place[0]:.2f} y {place[1]:.2f} m in other views, and here "
+            f"{places_of(view.things)}, {1e3 * gap:.0f} mm away"
+        )
+    return nearest
+
+
+def check_pixels(view: View, thing: Thing, voxel_size: float) -> None:
+    """Raise ViewError where pixels are too far apart on the thing to fill voxels of this size: most of its surface
+    would count as never seen."""
+    apart = float(np.median(view.frame.depth[thing.pixels])) / view.frame.intrinsics.fx
+    if voxel_size < PIXELS_A_VOXEL * apart:
+        least = math.ceil(1e4 * PIXELS_A_VOXEL * apart) / 1e4
+        raise ViewError(
+            f"its pixels are {1e3 * apart:.1f} mm apart on the object: expected a nearer camera, more pixels or "
+            f"voxel_size {least:g} m or larger, got {voxel_size:g}"
+        )
 
 
 def places_of(things: Sequence[Thing]) -> str:
@@ -160,9 +230,11 @@ def middle(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "2"]:
     return (points[:, :2].min(0) + points[:, :2].max(0)) / 2
 
 
-def _inside(local: Float[np.ndarray, "H W 3"], settings: LearnerSettings) -> Bool[np.ndarray, "H W"]:
-    x, y = local[..., 0] - settings.workspace_x, local[..., 1] - settings.workspace_y
-    return (np.abs(x) < settings.workspace_width / 2) & (np.abs(y) < settings.workspace_depth / 2)
+def _inside(xy: Float[np.ndarray, "H W 2"], settings: LearnerSettings, least: float = 0.0) -> Bool[np.ndarray, "H W"]:
+    """Whether places on the table are in the workspace, or in an area about its middle with sides of `least` metres."""
+    x, y = xy[..., 0] - settings.workspace_x, xy[..., 1] - settings.workspace_y
+    width, depth = max(settings.workspace_width, least), max(settings.workspace_depth, least)
+    return (np.abs(x) < width / 2) & (np.abs(y) < depth / 2)
 
 
 def _on_its_table(
@@ -170,14 +242,14 @@ def _on_its_table(
 ) -> Float[np.ndarray, "4 4"]:
     """The pose turned and raised by as little as puts the table that is seen at z = 0."""
     rotation, position = T_table_camera[:3, :3], T_table_camera[:3, 3]
-    local = points @ rotation.T + position
+    local, within = points @ rotation.T + position, settings.max_shift + TABLE_BEYOND
     with np.errstate(invalid="ignore"):
-        near = _inside(local, settings) & (np.abs(local[..., 2]) < TABLE_WITHIN)
+        near = _inside(local[..., :2], settings, TABLE_AREA) & (np.abs(local[..., 2]) < within)
     try:
         plane = find_plane(points[near][:: max(1, near.sum() // TUNING.table_points)])
     except ParseError:
         raise ViewError(
-            f"no table within {1e3 * TABLE_WITHIN:.0f} mm of where the camera pose puts it, inside the workspace"
+            f"no table within {1e3 * within:.0f} mm of where the camera pose puts it, about the workspace"
         ) from None
     normal = rotation @ plane.normal
     up = np.array([0.0, 0.0, 1.0])

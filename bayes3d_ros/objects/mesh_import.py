@@ -100,7 +100,7 @@ def make_models(
         mesh = load_mesh(path)
         try:
             yield _made(path, mesh.apply_scale(scale), voxel_size, path.stem in earlier)
-        except MeshError as error:
+        except ValueError as error:  # MeshError is one; others are of a model out of bounds
             given = "" if scale == 1 else f"at --scale {scale:g} "
             raise MeshError(f"{path}: {given}{error}") from error
 

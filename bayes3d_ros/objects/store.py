@@ -29,10 +29,12 @@ def refuse_existing(folder: Path, *names: str) -> None:
 
 
 def learned_from(model: ObjectModel) -> set[int]:
-    """Stamps (nanoseconds) of the views that a model was learned from; empty for one of a mesh."""
-    if model.provenance.get("kind") != "views":
+    """Stamps (nanoseconds) of the views that a model was learned from; empty for one of a mesh, and where its file does
+    not tell them."""
+    views = model.provenance.get("views") if model.provenance.get("kind") == "views" else None
+    if not isinstance(views, list):
         return set()
-    return {view["stamp_ns"] for view in model.provenance["views"]}
+    return {view["stamp_ns"] for view in views if isinstance(view, dict) and isinstance(view.get("stamp_ns"), int)}
 
 
 def model_path(folder: Path, name: str) -> Path:

@@ -71,6 +71,7 @@ class ObjectLearnerNode(Node):
         )
         self._newest: DepthMessages | None = None
         self._seen: dict[int, Thing] = {}  # what the captures of `_seen_of` show, by stamp
+        self._unusable: list[str] = []  # of its other captures, why they cannot be used
         self._seen_of: Path | None = None
         self._last = ""
         self._model = self.create_publisher(PointCloud2, "~/model", LATCHED)
@@ -123,7 +124,7 @@ class ObjectLearnerNode(Node):
         seen[frame.stamp_ns] = thing
         others = len(view.things) - 1
         beside = f", {others} other thing{'s' * (others > 1)} left out" if others else ""
-        cut = ", which the border of the image cuts off" if thing.cut_off else ""
+        cut = f", which {thing.cut_off} cuts off" if thing.cut_off else ""
         x, y = middle(thing.points)
         return (
             f"view {len(seen)} of {store.folder.name}: {len(thing.points)} points on the object at "
@@ -136,10 +137,15 @@ class ObjectLearnerNode(Node):
         if not frames:
             raise Refusal("; ".join(["nothing is captured yet: call ~/capture first", *problems]))
         replace = self._may_replace(store.folder.name, {frame.stamp_ns for frame in frames})
-        self.get_logger().info(f"building {store.folder.name} from {len(frames)} view{'s' * (len(frames) != 1)}")
-        learned = learn(frames[:MOST_VIEWS_A_MODEL], store.folder.name, settings)
+        seen = self._captured(store, settings)
+        usable = [frame for frame in frames if frame.stamp_ns in seen][:MOST_VIEWS_A_MODEL]
+        problems = [*self._unusable, *problems]
+        if not usable:
+            raise Refusal("; ".join([f"none of {len(frames)} views can be used", *problems]))
+        self.get_logger().info(f"building {store.folder.name} from {len(usable)} view{'s' * (len(usable) != 1)}")
+        learned = learn(usable, store.folder.name, settings)
         path = save_model(learned.model, self._library(), replace=replace)
-        self._publish(learned, frames[-1].stamp_ns)
+        self._publish(learned, usable[-1].stamp_ns)
         used = sum(not view.refused for view in learned.views)
         size = " x ".join(f"{v:.3f}" for v in learned.model.box_size)
         refused = [f"view {k} left out: {v.refused}" for k, v in enumerate(learned.views, 1) if v.refused]
@@ -165,8 +171,8 @@ class ObjectLearnerNode(Node):
 
     def _reset(self) -> str:
         store = self._store()
+        self._seen_of = None  # first: a capture that cannot be deleted leaves others deleted
         count = store.clear()
-        self._seen_of = None
         return f"{count} captures of {store.folder.name} deleted"
 
     # What they need
@@ -198,13 +204,14 @@ class ObjectLearnerNode(Node):
             frames, problems = store.load()
             for problem in problems:
                 self.get_logger().warning(problem)
-            self._seen = {}
+            self._seen, self._unusable = {}, []
             for frame in frames:
                 try:
                     thing = choose_thing(segment(frame, settings), list(self._seen.values()), settings)
                     self._seen[frame.stamp_ns] = thing
-                except (ViewError, LearningError) as error:
-                    self.get_logger().warning(f"capture {frame.stamp_ns}: {error}")
+                except ViewError as error:
+                    self._unusable.append(f"the capture of stamp {frame.stamp_ns} is not used: {error}")
+                    self.get_logger().warning(self._unusable[-1])
             self._seen_of = store.folder
         return self._seen
 

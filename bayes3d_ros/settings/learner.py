@@ -15,8 +15,8 @@ class LearnerSettings:
 
     voxel_size: float = setting(
         0.004,
-        "edge length of a voxel of the learned model. Smaller keeps finer detail and needs more views; 3 to 5 mm "
-        "suit objects of a hand's size",
+        "edge length of a voxel of the learned model, at least 1.5 times the distance of neighbouring pixels on the "
+        "object, better twice. Smaller keeps finer detail; 3 to 5 mm suit objects of a hand's size",
         unit="m",
         low=0.001,
         high=0.05,
@@ -84,15 +84,15 @@ class LearnerSettings:
         "largest error of a camera pose that is corrected, as a displacement of the object. A view that needs "
         "more is left out. Raise it if good views are left out and the calibration is poor",
         unit="m",
-        low=0.0,
-        high=0.5,
+        low=0.001,
+        high=0.05,
     )
     max_turn: float = setting(
         0.09,
         "largest angle between the table in the image and the table of the camera pose that is corrected. A view "
         "with more is refused: its camera pose is wrong",
         unit="rad",
-        low=0.0,
+        low=0.001,
         high=0.5,
     )
 

@@ -469,6 +469,15 @@ def test_learn_at_a_place_from_one_view(tmp_path):
     assert model.box_size[2] < 0.08 < model.box_size[0]  # it lies
 
 
+def test_learn_makes_a_model_of_what_a_damaged_bag_holds(tmp_path):
+    (whole,) = (share_directory() / "bags" / "views_mustard_bottle").glob("*.mcap")
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(whole.read_bytes()[:-40])
+    result = run("learn", damaged, "--name", "mustard", "--library", tmp_path, "--voxel-size", "0.006", "--views", "2")
+    assert load_library(tmp_path).names == ("mustard",) and "2 of 2 views used" in result.stdout
+    assert_one_line(result, 2, damaged)
+
+
 def test_learn_refuses_a_name_that_exists_before_it_reads_anything(library, tmp_path):
     before = (library / "block.npz").read_bytes()
     result = run("learn", tmp_path / "no_bag", "--name", "block", "--library", library)

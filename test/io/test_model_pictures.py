@@ -103,7 +103,11 @@ def test_the_verdict_on_a_learned_model(box):
     )
     left_out = replace(learned, views=(*views, ViewReport(9, 0, 0.0, 0.0, "blurred")))
     assert learned_verdict(left_out).words.startswith("Check: 1 view left out (3 of 4 views used")
-    alone = Learned(box, np.eye(4), (replace(views[0], cut_off=True),), 0.4)
+    alone = Learned(box, np.eye(4), (replace(views[0], cut_off="the border of the image"),), 0.4)
     told = learned_verdict(alone)
     assert not told.healthy and "one view alone" in told.words and "cuts the object off" in told.words
     assert "apart" not in told.words
+    apart = learned_verdict(replace(learned, residual=float("nan")))
+    assert not apart.healthy and "no two views show the same part of its surface" in apart.words
+    little = learned_verdict(replace(learned, coverage=0.1))
+    assert not little.healthy and "only 10% of its surface was seen" in little.words

@@ -130,6 +130,13 @@ def test_import_names_models_by_file_stem(tmp_path):
     assert library.names == ("a", "b") and library.models[0].voxel_size == 0.005
 
 
+def test_a_mesh_out_of_bounds_is_named(tmp_path):
+    file = tmp_path / "far.obj"
+    trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation((3e5, 0, 0)).export(file)
+    with pytest.raises(MeshError, match=r"far\.obj: origin holds"):
+        list(import_meshes([file], tmp_path / "library"))
+
+
 def test_two_meshes_of_one_stem_are_refused_before_anything_is_written(tmp_path):
     paths = [write_box(tmp_path / "a.stl"), write_box(tmp_path / "other" / "a.stl")]
     with pytest.raises(MeshError, match="names the same object as"):

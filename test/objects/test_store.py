@@ -12,7 +12,7 @@ import trimesh
 
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import LibraryError
-from bayes3d_ros.objects.store import load_library, load_model, refuse_existing, save_model
+from bayes3d_ros.objects.store import learned_from, load_library, load_model, refuse_existing, save_model
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +139,20 @@ def test_what_exists_is_refused_by_name_before_work_begins(model, tmp_path):
     with pytest.raises(LibraryError) as error:
         refuse_existing(tmp_path, "mug", "bowl", "my_mug-1")
     assert str(error.value).startswith(f"{tmp_path / 'mug.npz'}, {path}: models of these names exist already")
+
+
+@pytest.mark.parametrize(
+    "provenance, stamps",
+    [
+        ({"kind": "mesh"}, set()),
+        ({"kind": "views", "views": [{"stamp_ns": 3}, {"stamp_ns": 5}]}, {3, 5}),
+        ({"kind": "views"}, set()),
+        ({"kind": "views", "views": None}, set()),
+        ({"kind": "views", "views": ["3", {"stamp_ns": "5"}, {}]}, set()),
+    ],
+)
+def test_the_views_of_a_model_are_those_that_its_file_tells(model, provenance, stamps):
+    assert learned_from(dataclasses.replace(model, provenance=provenance)) == stamps
 
 
 def test_library_is_sorted_by_the_names_inside_the_files(model, tmp_path):
