@@ -31,18 +31,20 @@ help:
 setup: $(STAMP)
 
 # With ROS 2 sourced its own rclpy is used, through --system-site-packages; elsewhere the same Jazzy comes as wheels.
+# --ignore-installed: of what pip needs none is apt's. Its matplotlib is built for numpy 1, and its colcon starts nodes
+# with the system's Python.
 $(STAMP): setup.py pyproject.toml setup.cfg Makefile tools/find_python.sh
 	@set -e; python=$$(PYTHON="$(PYTHON)" tools/find_python.sh); \
-	extras=sim,experiments,test,lint,colcon; options=; \
+	extras=sim,experiments,test,lint,colcon; options=; own=; \
 	if "$$python" -c 'import rclpy' >/dev/null 2>&1; then \
-	    options=--system-site-packages; echo "setup: using the ROS 2 that is sourced ($${ROS_DISTRO:-unknown})"; \
+	    options=--system-site-packages; own=--ignore-installed; echo "setup: using the ROS 2 that is sourced ($${ROS_DISTRO:-unknown})"; \
 	else \
 	    extras=ros,$$extras; echo "setup: no ROS 2 sourced; installing ROS 2 Jazzy's wheels from PyPI"; \
 	fi; \
 	echo "setup: making $(VENV) with $$python and installing [$$extras]; a few minutes the first time"; \
 	"$$python" -m venv --clear $$options $(VENV); \
 	touch $(VENV)/COLCON_IGNORE; \
-	$(BIN)/python -m pip install -qq --editable ".[$$extras]"; \
+	$(BIN)/python -m pip install -qq $$own --editable ".[$$extras]"; \
 	touch $(STAMP); echo "setup: done; the command is $(BIN)/bayes3d"
 
 demo: setup

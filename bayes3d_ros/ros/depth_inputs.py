@@ -17,7 +17,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.ros.camera_pose_source import NO_POSE, CameraPose, CameraPoseSource
 from bayes3d_ros.ros.depth_transport import TRANSPORTS, DepthMessage, depth_topic, other_transport
 from bayes3d_ros.ros.diagnostics import InputView, TopicView
-from bayes3d_ros.ros.from_messages import frame_from_messages, stamp_to_ns
+from bayes3d_ros.ros.from_messages import CameraInfoError, frame_from_messages, stamp_to_ns
 from bayes3d_ros.ros.input_queue import InputQueue
 from bayes3d_ros.ros.input_topics import INFO_INPUT
 from bayes3d_ros.ros.node_settings import DepthInputSettings
@@ -28,18 +28,21 @@ _POLL = 0.02  # seconds between two looks at what waits, where something does
 
 
 class DepthMessages(NamedTuple):
-    """An image with all that is known of its camera; `arrived` in seconds of time.monotonic, `topic` the image's."""
+    """An image with all that is known of its camera; `arrived` in seconds of time.monotonic; names of topics."""
 
     image: DepthMessage
     info: CameraInfo
     pose: CameraPose
     arrived: float
     topic: str
+    info_topic: str
 
     def frame(self) -> DepthFrame:
         """The frame that they are of. ValueError with one line that names the topic, the message and the field."""
         try:
             return frame_from_messages(self.image, self.info, self.pose.T_table_camera)
+        except CameraInfoError as error:
+            raise ValueError(f"{self.info_topic}: {error}") from None
         except ValueError as error:
             raise ValueError(f"{self.topic}: {error}") from None
 
@@ -203,5 +206,5 @@ class DepthInputs:
             self._pose_used = complete.pose
             self._delivered_at = time.monotonic()
             self.delivered += 1
-            topic = self._image_topic.topic
-            self._deliver(DepthMessages(complete.image, complete.info, complete.pose, complete.arrived, topic))
+            topics = self._image_topic.topic, self._info_topic.topic
+            self._deliver(DepthMessages(complete.image, complete.info, complete.pose, complete.arrived, *topics))

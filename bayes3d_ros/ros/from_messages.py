@@ -31,15 +31,23 @@ def depth_from_compressed(image: CompressedImage) -> Float[np.ndarray, "height w
     return decode_compressed_depth(image.data, image.format)
 
 
+class CameraInfoError(ValueError):
+    """A CameraInfo that cannot be used; one line that names the field."""
+
+
 def intrinsics_from_message(info: CameraInfo, width: int, height: int) -> Intrinsics:
-    """The intrinsics of an image of this size. ValueError with one line naming the field that is wrong."""
-    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height))
+    """The intrinsics of an image of this size. Raises CameraInfoError."""
+    try:
+        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height))
+    except ValueError as error:
+        raise CameraInfoError(str(error)) from None
 
 
 def frame_from_messages(
     image: Image | CompressedImage, info: CameraInfo, T_table_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> DepthFrame:
-    """A frame for the parser. ValueError with one line naming the message and field that is wrong."""
+    """A frame for the parser. ValueError (of the CameraInfo CameraInfoError) with one line naming the message and field
+    that is wrong."""
     try:
         # First: an image of a wrong size must not be blamed on its CameraInfo.
         depth = depth_from_compressed(image) if isinstance(image, CompressedImage) else depth_from_image(image)

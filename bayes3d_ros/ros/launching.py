@@ -25,6 +25,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.depth_transport import RAW
 from bayes3d_ros.ros.input_topics import DEPTH_INPUT, INFO_INPUT, POSE_INPUT, full_name, played, resolved
 from bayes3d_ros.ros.processes import START_SECONDS
 from bayes3d_ros.ros.rviz_config import INFO_BESIDE_IMAGE, rviz_config
@@ -168,7 +169,7 @@ def _rviz(
     topics: dict[str, str], node: str, values: dict[str, str], tf: list[tuple[str, str]], environment: dict[str, str]
 ) -> Node:
     file = Path(launch_config.log_dir) / f"rviz{node.replace('/', '_')}.rviz"  # beside launch's own log
-    file.write_text(rviz_config(node, topics["depth"], values["rviz_frame"]))
+    file.write_text(rviz_config(node, topics["depth"], values["rviz_frame"], values["depth_transport"] or RAW))
     beside = f"{topics['depth'].rpartition('/')[0]}/{INFO_BESIDE_IMAGE}"
     info = [(beside, topics["camera_info"])] if beside != topics["camera_info"] else []
     return Node(

@@ -8,6 +8,7 @@ from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.depth_transport import RAW, TRANSPORTS
 from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.ros.planning_scene import why_not
+from bayes3d_ros.ros.tf_poses import NO_TF, tf2_ros
 from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 
 CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser
@@ -86,7 +87,9 @@ class SceneParserNodeSettings(DepthInputSettings):
         unit="m, rad",
     )
     publish_tf: bool = setting(
-        False, "send the pose of every object to tf, as the frame NODE/ID below the frame of the poses; needs tf2_ros"
+        False,
+        "send the pose of every object to tf, as the frame NODE/ID below the frame of the poses; needs tf2_ros, and is "
+        "refused without it",
     )
     planning_scene: bool = setting(
         False,
@@ -120,6 +123,8 @@ class SceneParserNodeSettings(DepthInputSettings):
         sigma = self.camera_pose_sigma
         if len(sigma) != 2 or not all(0.0 <= value <= 1.0 for value in sigma):
             raise ValueError(f"camera_pose_sigma must be two numbers in [0, 1], m and rad, got {list(sigma)}")
+        if self.publish_tf and tf2_ros is None:
+            raise ValueError(f"publish_tf: {NO_TF}")
         if self.planning_scene and (problem := why_not(self.output_frame)):
             raise ValueError(f"planning_scene {problem}")
 

@@ -7,20 +7,23 @@ from typing import Any
 import yaml
 
 from bayes3d_ros.resources import share_directory
+from bayes3d_ros.ros.depth_transport import RAW
 
 NODE_IN_FILE, IMAGE_IN_FILE = "/scene_parser", "/depth/image_rect"  # it fits a node of that name as it is
 # image_transport takes the CameraInfo of an image from this name beside it; RViz has no setting for it.
 INFO_BESIDE_IMAGE = "camera_info"
+_TRANSPORT = "Depth Map Transport Hint"  # the name of RViz's setting
 
 
-def rviz_config(node: str, depth: str, frame: str) -> str:
-    """The text of a configuration for a scene_parser, given full names, and with `frame` as RViz's fixed frame."""
+def rviz_config(node: str, depth: str, frame: str, transport: str = RAW) -> str:
+    """The text of a configuration for a scene_parser, given full names, the depth images' transport, and with `frame`
+    as RViz's fixed frame."""
     config = yaml.safe_load((share_directory() / "config" / "bayes3d.rviz").read_text())
     config["Visualization Manager"]["Global Options"]["Fixed Frame"] = frame
 
     def named(value: Any) -> Any:
         if isinstance(value, dict):
-            return {key: named(item) for key, item in value.items()}
+            return {key: transport if key == _TRANSPORT else named(item) for key, item in value.items()}
         if isinstance(value, list):
             return [named(item) for item in value]
         if value == IMAGE_IN_FILE:

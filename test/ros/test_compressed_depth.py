@@ -66,7 +66,8 @@ class CompressedBench:
     def is_refused(self, text: str, data: bytes, why: str) -> None:
         count = len(self.poses)
         self.send(text, data)
-        report = self.ros.wait_for_diagnosis(self.diagnostics, f"{TOPIC}: {why}")
+        topic = "/depth/camera_info" if why.startswith("CameraInfo") else TOPIC
+        report = self.ros.wait_for_diagnosis(self.diagnostics, f"{topic}: {why}")
         assert "\n" not in report.status[0].message and len(self.poses) == count
 
 

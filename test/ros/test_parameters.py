@@ -20,6 +20,7 @@ from bayes3d_ros.ros.node_settings import (
     SceneParserNodeSettings,
 )
 from bayes3d_ros.ros.parameters import SettingsParameters, describe, yaml_text
+from bayes3d_ros.ros.tf_poses import tf2_ros
 from bayes3d_ros.settings import RETIRED, LearnerSettings, ParserSettings
 
 
@@ -113,6 +114,7 @@ def test_whole_numbers_do_where_a_decimal_is_expected(declared: tuple[Node, Sett
         with_values("camera_pose_sigma:=[.nan, 0.0]"),
         with_values("output_frame:=3"),
         with_values("planning_scene:=true"),
+        *([] if tf2_ros else [with_values("publish_tf:=true")]),
         with_values("planning_scene:=yes, please"),
         with_values("qos_reliability:=perhaps"),
         with_values("depth_transport:=theora"),

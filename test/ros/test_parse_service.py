@@ -112,7 +112,7 @@ def test_it_is_not_ok_when_no_image_can_be_used(waiting: Robot) -> None:
     camera, ros = waiting.camera, waiting.ros
     image, info = camera.messages(depth_frame(10_000))
     info.width = 32
-    why = "no image for a request: /depth/image_rect: CameraInfo width, height: expected the image's 64x48"
+    why = "no image for a request: /depth/camera_info: CameraInfo width, height: expected the image's 64x48"
     send = lambda: camera.send(image, info) or any(why in d.status[0].message for d in waiting.diagnostics)  # noqa: E731
     ros.wait_for(send, "the line", pause=0.2)
 

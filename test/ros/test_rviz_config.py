@@ -67,6 +67,13 @@ def test_nothing_of_the_defaults_is_left_and_the_frame_is_set() -> None:
     assert yaml.safe_load(text)["Visualization Manager"]["Global Options"]["Fixed Frame"] == "front_optical_frame"
 
 
+@pytest.mark.parametrize("transport", ["raw", "compressedDepth"])
+def test_the_depth_is_shown_in_its_transport(transport: str) -> None:
+    text = rviz_config("/scene_parser", "/depth/image_rect", "camera", transport)
+    displays = yaml.safe_load(text)["Visualization Manager"]["Displays"]
+    assert [d["Depth Map Transport Hint"] for d in displays if d["Name"] == "Depth"] == [transport]
+
+
 def test_with_the_defaults_it_is_the_file_itself() -> None:
     text = rviz_config(module.NODE_IN_FILE, module.IMAGE_IN_FILE, "camera_depth_optical_frame")
     assert yaml.safe_load(text) == yaml.safe_load((share_directory() / "config" / "bayes3d.rviz").read_text())
