@@ -2,6 +2,7 @@
 
 """Whole frames: right answers on images of our own slow renderer, reproducible, and compiled once."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -190,6 +191,17 @@ def test_fewer_objects_than_there_is_room_for_have_the_same_posterior(parser, li
     ratio = SETTINGS.count_ratio
     normalised = np.log(sum(ratio**n for n in range(4)) / (1 + ratio))
     assert one.log_evidence == pytest.approx(many.log_evidence + np.log(of_two) + normalised, abs=1e-3)
+
+
+def test_the_odds_of_one_object_more_are_the_priors_times_the_evidences(parser, library):
+    """Twice the prior odds are twice the posterior's: the stages' evidences do not know the prior of n."""
+    observed, found = frame(library, ONE_BRICK)[0], []
+    for ratio in (0.1, 0.2):
+        other = copy(parser)
+        other.settings = replace(SETTINGS, count_ratio=ratio)
+        found.append(other.parse(observed).num_objects)
+    once, twice = (p[2] / p[1] for p in found)
+    assert once > 1e-6 and twice == pytest.approx(2 * once, rel=1e-4)
 
 
 def test_what_a_parser_cannot_be_changed_to_is_told_in_one_line(parser, library):

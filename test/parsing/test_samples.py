@@ -2,12 +2,14 @@
 
 """The table's part of a depth error, drawn given those of objects."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bayes3d_ros.likelihood.error_nodes import AMPLITUDE_LOG_SD, SENSOR_LOG_SD, TABLE_SHARE, ErrorNodes, sensor_scale
 from bayes3d_ros.objects.placement import Placement
-from bayes3d_ros.parsing.samples import Stage, _along_rays, _moved, _table_bias, _to_own_rays, pooled
+from bayes3d_ros.parsing.samples import Stage, _along_rays, _beside_pictures, _moved, _table_bias, _to_own_rays, pooled
 
 BIAS = 0.0012
 
@@ -28,6 +30,26 @@ def test_the_tables_bias_is_normal_given_those_of_objects(number):
     sd = np.sqrt(half - part.sum() * half)
     assert drawn.mean() == pytest.approx(part @ off[0, :number], abs=4 * sd / draws**0.5)
     assert drawn.std() == pytest.approx(sd, rel=0.02)
+
+
+def test_objects_lie_beside_their_pictures_by_the_outlines_displacement():
+    """Normal, by `outline` times the depth along x and y, and by the turn that moves the footprint's points as far, by
+    their root mean square."""
+    draws, outline, size = 20_000, 0.002, np.array([0.12, 0.05])
+    c, s = np.cos(0.7), np.sin(0.7)
+    T = np.array([[1, 0, 0, 0.02], [0, -s, -c, 0.05], [0, c, -s, 0.8], [0, 0, 0, 1.0]])
+    x, y, yaw = 0.1, -0.2, 1.0
+    picture = Placement(*(np.full((draws, 1), value) for value in (0, 2, x, y, yaw)))
+    library = SimpleNamespace(face_size=np.tile(size, (1, 6, 1)))
+    normal = np.random.default_rng(0).standard_normal((draws, 1, 3))
+    found = _beside_pictures(picture, normal, library, SimpleNamespace(T_camera_table=T), outline)
+    depth = (T @ [x, y, 0, 1])[2]
+    points = (np.stack(np.meshgrid(*[np.arange(100)] * 2), -1).reshape(-1, 2) / 99 - 0.5) * size
+    expected = np.array([1.0, 1.0, 1 / np.sqrt((points**2).sum(1).mean())]) * outline * depth
+    drawn = np.stack([found.x, found.y, found.yaw], -1)[:, 0]
+    np.testing.assert_allclose(drawn.mean(0), [x, y, yaw], atol=5 * expected.max() / draws**0.5)
+    np.testing.assert_allclose(drawn.std(0), expected, rtol=0.03)
+    assert (found.type == picture.type).all() and (found.face == picture.face).all()
 
 
 def test_objects_move_along_their_rays():

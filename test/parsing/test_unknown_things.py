@@ -136,9 +136,12 @@ def test_nothing_stands_on_an_empty_table(parser):
 
 
 def test_without_unknown_things_the_place_is_told(library):
+    """A closed world has no better name for the ball than a brick's; what the brick does not explain is told."""
     posterior = SceneParser(library, replace(SETTINGS, unknown=False)).parse(plain_frame(BALL))
     assert UNKNOWN not in posterior.types and posterior.num_unknown[0] > 0.999
-    assert posterior.unexplained or posterior.objects
+    assert [o.type for o in posterior.objects] == ["brick"]
+    assert posterior.unexplained and posterior.warnings
+    assert all(np.hypot(place.x - 0.1, place.y - 0.03) < 0.05 for place in posterior.unexplained)
 
 
 def test_a_fixed_number_counts_every_thing(library):
@@ -154,6 +157,20 @@ def test_with_room_for_one_the_larger_thing_is_told(parser):
     assert [o.type for o in one.objects] == [UNKNOWN] and one.num_objects[1] > 0.999
     assert one.log_evidence < -1000  # against things for which there is no room
     np.testing.assert_allclose(np.exp(one.samples.log_weight).sum(), 1, rtol=1e-4)
+
+
+@pytest.mark.parametrize("odds", [-1.0, 0.0, 2.0])
+def test_a_region_is_a_thing_with_its_odds_against_outliers(monkeypatch, odds):
+    """The likelihood has counted the thing's gain, 7 nats; in its place comes the sum over thing and outliers."""
+    seen, gain, scenes = observe(plain_frame(BRICK, BALL), SETTINGS), 7.0, 4000
+    thing = UnknownThing(np.array([0]), gain, np.ones(3), np.zeros(2), 0.0, np.zeros(3), 0.001, np.zeros((1, 2)))
+    monkeypatch.setattr(unknown_things, "_things", lambda mask, seen: (thing,))
+    depth = np.asarray(seen.image.bare_depth)
+    many = np.broadcast_to(depth, (scenes, *depth.shape))
+    found = unknown_things.find_things(many, seen, odds - gain, 3, False, np.random.default_rng(0))
+    np.testing.assert_allclose(found.log_weight, np.logaddexp(odds, 0.0) - gain)
+    share, p = np.mean([len(held) for held in found.held]), 1 / (1 + np.exp(-odds))
+    assert share == pytest.approx(p, abs=4 * (p * (1 - p) / scenes) ** 0.5)
 
 
 def test_with_room_for_one_the_likelier_thing_is_told(monkeypatch):
