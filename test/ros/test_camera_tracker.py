@@ -2,7 +2,6 @@
 
 """camera_tracker as a process of its own: poses in the world's frame at the image's stamp, silence while it is lost."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -93,12 +92,8 @@ def test_a_lost_camera_has_no_pose_and_says_why(rig):
 
 @pytest.fixture
 def placed(rig):
-    """placed(stamp_ns): send a pose on a topic that the node, which is started here, knows to have a publisher."""
+    """placed(patience): start the node beside a publisher of camera poses that it knows; returns send(stamp_ns)."""
     publisher = rig.ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
-    rig.start(patience=1.0)
-    rig.ros.wait_for(publisher.get_subscription_count, "a subscriber of the pose")
-    rig.ros.wait_for_diagnosis(rig.diagnostics, "no message", TRACKER)
-    rig.ros.spin_until(time.monotonic() + 1.0)  # the node has looked who publishes
 
     def send(stamp_ns):
         pose = PoseStamped()
@@ -106,39 +101,41 @@ def placed(rig):
         pose.pose.position.z, pose.pose.orientation.x, pose.pose.orientation.w = 1.0, 1.0, 0.0
         publisher.publish(pose)
 
-    return send
+    def started(patience):
+        rig.start(patience=patience)
+        rig.ros.wait_for(publisher.get_subscription_count, "a subscriber of the pose")
+        rig.ros.wait_for_diagnosis(rig.diagnostics, "no message", TRACKER)
+        return send
 
-
-def latency(rig):
-    report = rig.ros.wait_for_diagnosis(rig.diagnostics, "tracking", TRACKER)
-    return float({pair.key: pair.value for pair in report.status[0].values}["latency s"])
+    return started
 
 
 def test_only_the_first_frame_waits_for_a_camera_pose(rig, placed):
+    send = placed(patience=10.0)
     rig.show(10**9, 1.0)
-    rig.ros.spin_until(time.monotonic() + 0.4)
+    rig.ros.wait_for_diagnosis(rig.diagnostics, "or the camera's pose (/camera_pose, tf)", TRACKER)
     assert not rig.poses
-    placed(10**9)
+    send(10**9)
     rig.ros.wait_for(lambda: len(rig.poses) == 1, "the first pose")
-    assert latency(rig) > 0.4
     rig.show(2 * 10**9, 1.0)
-    rig.ros.wait_for(lambda: len(rig.poses) == 2, "a second pose")
-    assert latency(rig) < 0.4
+    rig.ros.wait_for(lambda: len(rig.poses) == 2, "a second pose", seconds=9.0)  # it would have waited for ten
 
 
 def test_a_first_frame_whose_camera_pose_is_missing_places_no_world(rig, placed):
     """Else the plane in one image would be called the table's frame for good."""
+    send = placed(patience=0.2)
     rig.show(10**9, 1.0)
     rig.ros.wait_for_diagnosis(rig.diagnostics, "no camera pose places the world in 'bench': /camera_pose: no", TRACKER)
     assert not rig.poses
-    placed(2 * 10**9)
+    send(2 * 10**9)
     rig.show(2 * 10**9, 1.0)
     rig.ros.wait_for(lambda: rig.poses, "a pose in the world that the second frame places")
     assert stamp_to_ns(rig.poses[0].header.stamp) == 2 * 10**9
 
 
 def test_after_a_reset_the_next_frame_waits_for_a_camera_pose_again(rig, placed):
-    placed(10**9)
+    send = placed(patience=0.2)
+    send(10**9)
     rig.show(10**9, 1.0)
     rig.ros.wait_for(lambda: rig.poses, "a pose")
     assert rig.ros.call(Trigger, "/camera_tracker/reset", Trigger.Request()).success
