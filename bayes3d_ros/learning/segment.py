@@ -105,7 +105,7 @@ class _LeftOut(NamedTuple):
 def _left_out(
     frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"], lowest: float, settings: LearnerSettings
 ) -> _LeftOut:
-    depth = np.where(frame.depth > 0, frame.depth, np.nan)
+    depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, np.nan)
     local = unproject(depth, frame.intrinsics).astype(np.float64) @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
     with np.errstate(invalid="ignore"):
         above = np.isfinite(depth) & (local[..., 2] > lowest)
