@@ -25,7 +25,7 @@ from bayes3d_ros.settings import LearnerSettings
 
 if TYPE_CHECKING:  # --help must be quick
     from bayes3d_ros.geometry.depth_frame import DepthFrame
-    from bayes3d_ros.io.bags import BagDamage, FrameReader
+    from bayes3d_ros.io.bags import FrameReader
 
 
 @click.command(cls=CommandWithSettings, kind=LearnerSettings)
@@ -122,12 +122,12 @@ class _Readable:
 
     def __init__(self, frames: "FrameReader") -> None:
         self._frames = frames
-        self.damage: "BagDamage | None" = None
+        self.damage: Exception | None = None
 
     def __iter__(self) -> Iterator["DepthFrame"]:
-        from bayes3d_ros.io.bags import BagDamage as Damage
+        from bayes3d_ros.io.bags import BagDamage
 
         try:
             yield from self._frames
-        except Damage as error:  # raised after the last frame
+        except BagDamage as error:  # raised after the last frame
             self.damage = error

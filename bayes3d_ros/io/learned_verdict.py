@@ -17,7 +17,7 @@ def learned_verdict(learned: Learned) -> Verdict:
     wrong = [] if len(used) == len(learned.views) else [_left_out(len(learned.views) - len(used))]
     if len(used) == 1:
         wrong.append("one view alone: its far side is unknown")
-    wrong += [f"{limit} cuts the object off" for limit in sorted({view.cut_off for view in used if view.cut_off})]
+    wrong += [f"{limit} cuts the object off" for limit in learned.cut_off]
     if len(used) > 1 and not np.isfinite(learned.residual):
         wrong.append("no two views show the same part of its surface: nothing tells whether their camera poses agree")
     if learned.coverage < _LEAST_SEEN:

@@ -68,10 +68,10 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     grid = _grid([view.surface for view in views], voxel_size)
     centres = grid.centres()
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
+    if not hits.any():
+        raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
     passes, glimpses = rays.reshape(2, *grid.shape)
-    if not (hits > 0).any():
-        raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
     surface = _pieces((hits > 0) & (HIT * hits - GLIMPSE * glimpses - (PASS - GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")

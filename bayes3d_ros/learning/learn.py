@@ -24,6 +24,7 @@ from bayes3d_ros.learning.segment import (
     ViewError,
     check_pixels,
     middle,
+    nearest_thing,
     places_of,
     segment,
     surface,
@@ -65,19 +66,26 @@ class Learned:
     residual: float = float("nan")
 
     @property
+    def cut_off(self) -> dict[str, list[int]]:
+        """What cuts the object off in views that were used, and the numbers of these, from 1 on."""
+        views_at: dict[str, list[int]] = {}
+        for number, view in enumerate(self.views, 1):
+            if view.cut_off and not view.refused:
+                views_at.setdefault(view.cut_off, []).append(number)
+        return views_at
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know of this model, one line each."""
-        used = {number: view for number, view in enumerate(self.views, 1) if not view.refused}
+        used = sum(not view.refused for view in self.views)
         one = (
             "learned from one view: the side that it hides is unknown, and closed by the convex hull of what was seen",
         )
-        limits = sorted({view.cut_off for view in used.values() if view.cut_off})
-        views_at = {limit: [f"view {k}" for k, view in used.items() if view.cut_off == limit] for limit in limits}
         beyond = (
-            f"{limit} cuts the object off in {', '.join(views)}: what is beyond is not seen"
-            for limit, views in views_at.items()
+            f"{limit} cuts the object off in {', '.join(f'view {k}' for k in views)}: what is beyond is not seen"
+            for limit, views in self.cut_off.items()
         )
-        return (*(one if len(used) == 1 else ()), *beyond)
+        return (*(one if used == 1 else ()), *beyond)
 
 
 def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | None = None) -> Learned:
@@ -186,7 +194,7 @@ def choose_thing(view: View, before: Sequence[Thing], settings: LearnerSettings)
         chosen = thing_beside(view, before, within)
     elif settings.cluster == "central":
         centre = np.array([settings.workspace_x, settings.workspace_y])
-        chosen = min(view.things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - centre)))
+        chosen = nearest_thing(view, centre)
     elif settings.cluster == "only" and len(view.things) > 1:
         raise ViewError(
             f"{places_of(view.things)}: expected one, or the place of the one to learn (at_x, at_y; --at X Y), "

@@ -67,12 +67,13 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
         returned = (frame.depth >= settings.near) & (frame.depth <= settings.far)
     if not returned.any():
         raise ViewError(f"the depth image has no return between {settings.near} and {settings.far} m")
+    every = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, np.nan)
     depth = np.where(returned, frame.depth, np.nan)
-    points = unproject(depth, frame.intrinsics).astype(np.float64)
-    T_table_camera = _on_its_table(points, frame.T_table_camera, settings)
+    points = unproject(every, frame.intrinsics).astype(np.float64)
+    T_table_camera = _on_its_table(np.where(returned[..., None], points, np.nan), frame.T_table_camera, settings)
     local = points @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
     with np.errstate(invalid="ignore"):
-        inside = _inside(local[..., :2], settings) & (local[..., 2] < settings.workspace_height)
+        inside = returned & _inside(local[..., :2], settings) & (local[..., 2] < settings.workspace_height)
         flat = inside & (np.abs(local[..., 2]) < LOWEST[1])
     spread = 1.4826 * np.median(np.abs(local[flat][:, 2])) if flat.any() else 0.0
     lowest = float(np.clip(3 * spread, *LOWEST))
@@ -90,7 +91,7 @@ def segment(frame: DepthFrame, settings: LearnerSettings) -> View:
             f"nothing stands on the table inside the workspace ({risen.sum()} returns more than "
             f"{1e3 * lowest:.0f} mm above it, expected at least {FEWEST_PIXELS} together)"
         )
-    left_out = _left_out(frame, T_table_camera, lowest, settings)
+    left_out = _left_out(every, local, lowest, settings)
     pixels = [np.nonzero(labels == k) for k in found]
     return View(frame, T_table_camera, tuple(Thing(local[at], at, _cut_by(at, depth, left_out)) for at in pixels))
 
@@ -103,12 +104,10 @@ class _LeftOut(NamedTuple):
 
 
 def _left_out(
-    frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"], lowest: float, settings: LearnerSettings
+    depth: Float[np.ndarray, "H W"], local: Float[np.ndarray, "H W 3"], lowest: float, settings: LearnerSettings
 ) -> _LeftOut:
-    depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, np.nan)
-    local = unproject(depth, frame.intrinsics).astype(np.float64) @ T_table_camera[:3, :3].T + T_table_camera[:3, 3]
     with np.errstate(invalid="ignore"):
-        above = np.isfinite(depth) & (local[..., 2] > lowest)
+        above = local[..., 2] > lowest
         by = (
             ("near or far", above & ((depth < settings.near) | (depth > settings.far))),
             ("workspace_height", above & (local[..., 2] >= settings.workspace_height)),
@@ -187,6 +186,11 @@ def thing_at(view: View, place: tuple[float, float], within: float) -> Thing:
     return view.things[nearest]
 
 
+def nearest_thing(view: View, place: Float[np.ndarray, "2"]) -> Thing:
+    """The thing whose middle is nearest to a place on the table."""
+    return min(view.things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - place)))
+
+
 def thing_beside(view: View, before: Sequence[Thing], within: float) -> Thing:
     """The thing that was chosen in the views before: the one whose middle is nearest to theirs. Raises ViewError if it
     is farther from them than they are wide and `within` metres: then it is another thing, and theirs is not in sight.
@@ -194,7 +198,7 @@ def thing_beside(view: View, before: Sequence[Thing], within: float) -> Thing:
     From opposite sides two views may show opposite sides of a thing, which are apart by its width.
     """
     place = np.mean([middle(thing.points) for thing in before], 0)
-    nearest = min(view.things, key=lambda thing: float(np.linalg.norm(middle(thing.points) - place)))
+    nearest = nearest_thing(view, place)
     seen = np.concatenate([thing.points[:, :2] for thing in before])
     low, high, own = seen.min(0), seen.max(0), nearest.points[:, :2]
     gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(own.min(0) - high, low - own.max(0)))))

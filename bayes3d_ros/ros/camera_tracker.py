@@ -83,8 +83,8 @@ class CameraTrackerNode(Node):
         self._known: Tracking | None = None  # the worker's own
         self._waited = 0.0  # seconds that the last frame's search took the worker's time; its own too
         self._has_pose = False  # whether the last frame gave one
-        self._begun = 0
-        self._places_world = True  # whether the next frame places the world's frame, and needs the camera's pose
+        self._begun = 0  # trackers so far
+        self._placed = 0  # which of them had its world's frame placed last: then images need no camera pose any more
         self._told = ""
         self._path = CameraPath(self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", RELIABLE)
@@ -118,7 +118,7 @@ class CameraTrackerNode(Node):
         if world is not None:
             self._told = f"the world is {len(world.types)} known object{'s' * (len(world.types) != 1)}"
         self._begun += 1
-        begun, self._places_world = self._begun, True
+        begun = self._begun
         self._parts.worker.forget()  # an image that came without its pose must not place the new world
 
         def job() -> None:
@@ -171,8 +171,7 @@ class CameraTrackerNode(Node):
         now = time.monotonic()
         self._known = known
         self._waited = now - began if estimate.found_again else 0.0
-        if self._begun == session.begun:  # else this tracker's time is over
-            self._places_world = False
+        self._placed = session.begun
         if estimate.lost:
             self._no_pose(f"lost: {estimate.lost}")
             return
@@ -206,7 +205,7 @@ class CameraTrackerNode(Node):
 
     def _listen(self) -> None:
         # Only the first frame is placed by a pose; later ones need not wait for theirs.
-        self._parts.listen(self._parts.worker.submit, wants_pose=lambda: self._places_world)
+        self._parts.listen(self._parts.worker.submit, wants_pose=lambda: self._placed != self._begun)
 
     def _parameters_changed(self, names: set[str]) -> None:
         if names & DEPTH_INPUT_PARAMETERS:

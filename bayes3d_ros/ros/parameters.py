@@ -95,12 +95,12 @@ class SettingsParameters:
             except UnfinishedSettings:
                 return  # `read` refuses them until the others are set
             except ValueError as error:
-                wrong = [field for field in map(named.get, re.findall(r"\w+", str(error))) if field is not None]
-                wrong = [field for field in wrong if self._differs(field)]
-                if not wrong:
+                words = re.findall(r"\w+", str(error))
+                wrong = next((named[word] for word in words if word in named and self._differs(named[word])), None)
+                if wrong is None:
                     raise
-                self.problems[wrong[0].name] = f"parameter {error}"
-                self._use_default(wrong[0])
+                self.problems[wrong.name] = f"parameter {error}"
+                self._use_default(wrong)
 
     def _differs(self, field: Field) -> bool:
         """Whether a parameter has another value than its default."""
