@@ -12,7 +12,7 @@ import click
 from bayes3d_ros.cli.errors import InputError
 from bayes3d_ros.cli.options import FOLDER, device_option
 from bayes3d_ros.cli.progress import progress, say
-from bayes3d_ros.cli.unfinished import CannotGoOnError, left_over
+from bayes3d_ros.cli.unfinished import CannotGoOnError, left_over, set_aside
 from bayes3d_ros.files.atomic import write_json
 from bayes3d_ros.validation.commit import commit
 from bayes3d_ros.validation.experiments import EXPERIMENTS, ON_FOLDER, Experiment
@@ -32,6 +32,8 @@ def evaluate(experiment: str, folder: Path | None, quick: bool, fresh: bool, out
 
     FOLDER is for real-scenes only: the recordings that it parses. Default: the folder BAYES3D_DATA, else
     ../shared/data.
+
+    Where a run starts anew, the file of the one before is kept as EXPERIMENT.json~.
 
     docs/evaluations.md says what each experiment measures. `bayes3d report` makes a page of each.
     """
@@ -56,6 +58,8 @@ def evaluate(experiment: str, folder: Path | None, quick: bool, fresh: bool, out
         click.echo(note, err=True)
     if not fresh:
         _go_on(report, file)
+    if not report["steps_done"] and (kept := set_aside(file)):
+        click.echo(f"the results of an earlier run are kept as {kept}", err=True)
     write_json(file, report)  # now, so that a folder that cannot be written to is known before minutes of measuring
     click.echo(module.HEADER)
     _measure(module, report, file)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an interrupted `bayes3d evaluate` left, and whether another run may go on with it."""
+"""What an earlier `bayes3d evaluate` left: whether another run may go on with it, and where it is kept if not."""
 
 import json
 from collections.abc import Sequence
@@ -48,6 +48,20 @@ def left_over(file: Path, report: dict[str, Any]) -> LeftOver:
     if not 0 <= done <= report["steps"] or (rows and not done):
         raise CannotGoOnError("is damaged")
     return LeftOver(done, rows, runs)
+
+
+def set_aside(file: Path) -> Path | None:
+    """Rename the file of an earlier run that measured something, as hours of measuring may be in it: with a `~` behind
+    its name, in place of the one that was so called. None where there is none. Raises OSError."""
+    try:
+        earlier = json.loads(file.read_text())
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError):
+        earlier = None  # damaged: still somebody's file
+    if isinstance(earlier, dict) and not earlier.get("rows"):
+        return None
+    return file.replace(file.with_name(f"{file.name}~"))
 
 
 def _objects(value: Any) -> list[dict[str, Any]] | None:

@@ -74,7 +74,8 @@ def type_beyond_training(summary: Summary) -> Ours | None:
     theirs = _of_networks(_losses(summary, condition, "log_loss"))
     if not inside or not outside or not theirs:
         return None
-    allowed = 2 * sum(0.25 / one["images"] for one in (inside, outside)) ** 0.5
+    variances = (one["accuracy"] * (1 - one["accuracy"]) / one["images"] for one in (inside, outside))
+    allowed = 2 * sum(variances) ** 0.5
     told = f"right {inside['accuracy']:.1%}, out of distribution {outside['accuracy']:.1%}"
     losses = f"log loss there {outside['log_loss']:.2f}, of the best network {min(theirs):.2f}"
     kept = outside["accuracy"] >= inside["accuracy"] - allowed

@@ -153,6 +153,21 @@ def test_a_finished_run_is_done_again(experiment, tmp_path: Path) -> None:
     assert starts_anew(experiment, result) and "starting anew" not in result.stderr
 
 
+def test_what_an_earlier_run_measured_is_kept(experiment, interrupted: Path) -> None:
+    earlier, kept = interrupted.read_text(), interrupted.with_name("planted.json~")
+    result = run(interrupted.parent)
+    assert not kept.exists() and "kept" not in result.stderr  # the run went on
+    interrupted.write_text(earlier.replace('"quick": false', '"quick": true'))
+    changed = interrupted.read_text()
+    assert changed != earlier
+    result = run(interrupted.parent)
+    assert f"the results of an earlier run are kept as {kept}" in result.stderr.splitlines()
+    assert kept.read_text() == changed and json.loads(interrupted.read_text())["summary"]["rows"] == 10
+    interrupted.write_text("damaged")
+    run(interrupted.parent)
+    assert kept.read_text() == "damaged"
+
+
 def test_fresh_starts_anew(experiment, interrupted: Path) -> None:
     result = run(interrupted.parent, "--fresh")
     assert starts_anew(experiment, result) and "starting anew" not in result.stderr

@@ -14,8 +14,8 @@ from bayes3d_ros.posterior.types import ParseError, SceneSamples
 from bayes3d_ros.validation.experiments import mug_pose
 from bayes3d_ros.validation.experiments.mug_pose_parser import INDEPENDENT, KnownMug, ParserStep, parser_rows
 from bayes3d_ros.validation.experiments.mug_pose_summary import PARSER
-from bayes3d_ros.validation.experiments.mug_pose_truth import Truth
-from bayes3d_ros.validation.networks.von_mises import VonMises
+from bayes3d_ros.validation.experiments.mug_pose_truth import Truth, mug_row
+from bayes3d_ros.validation.networks.von_mises import Mixture, VonMises
 from bayes3d_ros.validation.reference.exact_yaw import entropy, every_yaw, yaw_axis, yaw_posterior
 from bayes3d_ros.validation.simulate.mug_images import (
     MUG_CAMERA,
@@ -104,6 +104,9 @@ def test_cross_entropy_is_least_of_the_posterior_itself():
     exact /= exact.sum()
     own, other = (yaw_scores(d, axis, exact, 1.1) for d in (q.log_density, VonMises(1.2, 20.0).log_density))
     assert own.cross_entropy == pytest.approx(entropy(exact), abs=1e-9) and own.cross_entropy < other.cross_entropy
+    sure = yaw_scores(VonMises(-2.0, 1e6).log_density, axis, exact, 1.1)
+    assert sure.cross_entropy > 1e5 and sure.floored == pytest.approx(np.log(200 * np.pi), abs=0.01)
+    assert own.floored == pytest.approx(own.cross_entropy - np.log1p(-0.01), abs=0.01)
     assert own.log_p_true == pytest.approx(float(q.log_density(np.array([1.1]))[0]))
 
 
@@ -189,6 +192,9 @@ def test_the_parsers_rows_score_its_samples(rows_of_parser):
     resultant = float(np.cos(0.05))
     assert row["log_p_true"][0] == pytest.approx(0.5 * np.log(1 / (2 * (1 - resultant)) / (2 * np.pi)), abs=0.01)
     assert row["samples_log_p_true"][0] > 0 and row["failed"] == 0
+    ((mean, concentration),) = row["von_mises"][0]
+    assert concentration == pytest.approx(1 / 0.05**2, rel=0.01) and "member_cross_entropy" not in row
+    assert np.cos(mean - row["yaw"][0]) == pytest.approx(1, abs=1e-6)
     assert (row["file_bytes"], row["memory_bytes"], row["padded_memory_bytes"]) == (2048, 32, 64)
     assert row["method"] == "Bayes3D (independent)" and row["training"] == 5
     assert [row["test"], *(o["test"] for o in others)] == list(MUG_CONDITIONS)
@@ -199,6 +205,7 @@ def test_the_parsers_rows_score_its_samples(rows_of_parser):
 def made_up(method, training, loss, test="as trained"):
     row = {"method": method, "training": training, "test": test, "seconds": 1.0, "memory_bytes": 4000}
     row |= {"cross_entropy": [loss, loss + 1], "log_p_true": [-loss, -loss], "file_bytes": 1000 * (training + 1)}
+    row |= {"floored": [loss, loss + 0.5]}
     row |= {"entropy": [-3.0, 0.1], "best_von_mises": [-2.9, 0.2]}
     row |= {"sd": [1.0, 40.0], "exact_sd": [0.8, 30.0], "handle": [1.0, 0.0]}
     if method == PARSER:
@@ -216,6 +223,8 @@ def test_summary_lines_and_picture(tmp_path):
     ten = told["as trained: Bayes3D 10"]
     assert (ten["cross_entropy"], ten["in_sight"], ten["hidden"]) == (0.85, 0.35, 1.35)
     assert (ten["images"], ten["failed"]) == (4, 2) and "less_ours" not in ten
+    assert (ten["median"], ten["floored"]) == (0.85, 0.6)
+    assert told["as trained: network 1 M 10"]["ours_lower"] == 1 and told["undecided"] == []
     assert told["as trained: network 1 M 10"]["less_ours"] == pytest.approx([1.2, 1.2, 1.2])
     assert told["trained: network 1 M 100"]["rate"] == 1e-3
     assert told["as trained: exact"] == {"entropy": -1.45, "best_von_mises": -1.35}
@@ -240,6 +249,29 @@ def test_what_is_not_met_is_judged_with_five_views():
     assert told["moved: Bayes3D 5"]["above_exact"] == pytest.approx(0.9 - -1.45)
     rows[3]["file_bytes"] = 16_001
     assert mug_pose.summary(rows)["not_met"][-1] == "a file of 16001 bytes"
+
+
+def test_where_the_interval_holds_zero_a_lower_loss_decides_nothing():
+    """Two groups of images: ours is better by 2 in one, and worse by 1 in the other."""
+    network = "network 1 M"
+    rows = [made_up(network, 100, 1.0) | {"cross_entropy": [3.0, 3.0, 0.0, 0.0], "entropy": [0.0] * 4}]
+    rows[0] |= {"handle": [1.0] * 4, "member_cross_entropy": [1.4, 1.6]}
+    rows += [made_up(PARSER, 5, 1.0) | {"cross_entropy": [1.0, 1.0]} for _ in range(2)]
+    told = mug_pose.summary(rows)
+    assert told["undecided"] == [f"as trained: {network}, 100 images"] and told["not_met"] == []
+    assert told[f"as trained: {network} 100"]["members"] == [1.4, 1.6]
+    assert told[f"as trained: {network} 100"]["ours_lower"] == 0.5
+
+
+def test_a_row_scores_every_member_on_its_own(clean, mug):
+    images = mug_images(mug, TRAINED, 1, (5,))
+    truth = Truth(images, np.array([yaw_posterior(images.depth[0], clean, TRAINED.noise)]), np.ones(1))
+    good, bad = VonMises(float(images.yaw[0]), 100.0), VonMises(float(images.yaw[0]) + 0.5, 100.0)
+    row = mug_row("network 1 M (ensemble)", 10, "as trained", [Mixture((good, bad))], [truth])
+    apart = row["member_cross_entropy"]
+    alone = [mug_row("network 1 M", 10, "as trained", [Mixture((one,))], [truth]) for one in (good, bad)]
+    assert apart == [one["cross_entropy"][0] for one in alone]
+    assert apart[0] < row["cross_entropy"][0] < apart[0] + np.log(2) + 0.001 < apart[1]
 
 
 @pytest.mark.parametrize("quick", [True, False])

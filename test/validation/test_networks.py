@@ -20,7 +20,8 @@ from bayes3d_ros.validation.networks.models import DepthNetwork, NetworkPlan, fi
 from bayes3d_ros.validation.networks.variants import Variant, predictions_of, train_variant, training_told
 
 PLAN = NetworkPlan((4, 8), (16,))
-QUICK = training.TrainingPlan(rates=(3e-3, 1e-2), batch=16, most_steps=60, check_every=10, patience=3)
+QUICK = training.TrainingPlan(rates=(3e-3, 1e-2), batch=16, most_steps=60, patience=30, cross_validated=0)
+LOSS = optax.softmax_cross_entropy_with_integer_labels
 
 
 @pytest.mark.parametrize("concentration", [0.0, 0.5, 30.0, 1e4])
@@ -124,9 +125,8 @@ def halves():
 def test_training_learns_what_can_be_learned_and_is_repeatable(halves):
     images, side = halves
     network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
-    loss = optax.softmax_cross_entropy_with_integer_labels
-    before = training.mean_loss(network, images, side, loss)
-    trained, again = (training.train_best(network, images, side, loss, QUICK, seed=3) for _ in range(2))
+    before = training.mean_loss(network, images, side, LOSS)
+    trained, again = (training.train_best(network, images, side, LOSS, QUICK, seed=3) for _ in range(2))
     assert before > 0.5 and trained.validation_loss < 0.05 and trained.training_loss < 0.05
     assert trained._replace(network=None, seconds=0) == again._replace(network=None, seconds=0)
     said = training.predictions(trained.network, images)
@@ -137,20 +137,23 @@ def test_training_learns_what_can_be_learned_and_is_repeatable(halves):
 def test_looks_tell_how_the_losses_fell(halves):
     images, side = halves
     network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
-    loss = optax.softmax_cross_entropy_with_integer_labels
-    trained = training.train_best(network, images, side, loss, QUICK, seed=3)
+    trained = training.train_best(network, images, side, LOSS, QUICK, seed=3)
     assert [look.step for look in trained.looks] == list(range(10, 10 * len(trained.looks) + 1, 10))
+    assert trained.looks[-1].step - trained.steps >= QUICK.patience and not trained.capped
+    patient = QUICK._replace(rates=(1e-4,), most_steps=151, patience=1000)
+    later = training.train_best(network, images, side, LOSS, patient, seed=3)
+    apart = np.diff([look.step for look in later.looks])
+    assert apart.tolist() == [10] * 10 + [11, 12, 13, 5] and later.looks[-1].step == 151 and later.capped
     assert trained.looks[0].training_loss > 0.3 > trained.looks[-1].training_loss
     assert min(look.validation_loss for look in trained.looks) == trained.validation_loss
 
 
 def test_an_ensemble_has_members_of_its_own_and_augmentation_other_images(halves):
     images, side = halves
-    loss = optax.softmax_cross_entropy_with_integer_labels
     short = QUICK._replace(most_steps=20)
 
     def trained(variant):
-        return train_variant(variant, images, side, 2, loss, short, seed=1)
+        return train_variant(variant, images, side, 2, LOSS, short, seed=1)
 
     (plain,), members = trained(Variant(PLAN)), trained(Variant(PLAN, members=3))
     said = predictions_of(members, images)
@@ -159,6 +162,7 @@ def test_an_ensemble_has_members_of_its_own_and_augmentation_other_images(halves
     told, of_one = training_told(members), training_told([plain])
     for key in ("parameters", "file_bytes", "memory_bytes"):
         assert told[key] == 3 * of_one[key]
+    assert members[1].rate == members[2].rate == plain.rate
     assert told["looks"] == of_one["looks"] and [step for step, *_ in told["looks"]] == [10, 20]
     (changed,) = trained(Variant(PLAN, augmentation=Augmentation(1, 0.1, 0.1, 0.1)))
     assert changed.looks[0].training_loss != plain.looks[0].training_loss
@@ -169,13 +173,29 @@ def test_training_stops_where_validation_gets_no_better(halves):
     images, _ = halves
     targets = np.random.default_rng(1).integers(2, size=len(images))
     network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
-    loss = optax.softmax_cross_entropy_with_integer_labels
     plan = QUICK._replace(rates=(1e-2,), most_steps=10_000, validation=0.5)
-    trained = training.train_best(network, images, targets, loss, plan, seed=0)
+    trained = training.train_best(network, images, targets, LOSS, plan, seed=0)
     assert trained.steps < 300
-    assert training.mean_loss(trained.network, images[20:], targets[20:], loss) == trained.validation_loss
+    assert training.mean_loss(trained.network, images[20:], targets[20:], LOSS) == trained.validation_loss
     with pytest.raises(ValueError, match="two images"):
-        training.train_best(network, images[:1], targets[:1], loss, plan, seed=0)
+        training.train_best(network, images[:1], targets[:1], LOSS, plan, seed=0)
+
+
+def test_of_few_images_every_part_is_held_out_and_all_are_trained_on(halves):
+    """Targets that say nothing: held out in turn, all of them tell so; two alone may well say that they are learned."""
+    images, side = halves
+    network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
+    few, plan = images[:10], QUICK._replace(cross_validated=100)
+    learned = training.train_best(network, few, side[:10], LOSS, plan, seed=0)
+    assert learned.steps > 0 and learned.validation_loss < 0.65
+    assert training.mean_loss(learned.network, few, side[:10], LOSS) == learned.training_loss < 0.3
+    again = training.train_best(network, few, side[:10], LOSS, plan._replace(rates=(learned.rate,)), seed=0)
+    np.testing.assert_array_equal(*(training.predictions(one.network, images) for one in (learned, again)))
+    nothing = np.array([0, 1] * 5)
+    by_heart = training.train_best(network, few, nothing, LOSS, plan._replace(most_steps=200), seed=0)
+    assert by_heart.steps <= 20 and by_heart.validation_loss > 0.5
+    two = training.train_best(network, few[:2], side[:2], LOSS, plan, seed=0)
+    assert np.isfinite(two.training_loss)
 
 
 def test_sizes_of_networks():

@@ -103,9 +103,19 @@ def test_the_summary_tells_what_is_worse_and_what_is_not_better():
     told = noise_ablation.summary(made_up({INFERRED: 0.95, "bad": 0.5, "good": 1.0}))
     assert told["low: inferred"]["right"] == 0.95 and told["low: bad"]["p_inferred_better"] < 1e-4
     assert told["low: inferred"]["log_score"] == pytest.approx(0.95 * np.log(0.9) + 0.05 * np.log(0.2), abs=1e-4)
-    assert told["not_met"] == ["better than good at no level"]
+    assert told["not_met"] == ["better than good at no level"] and told["better_at"] == {"bad": ["low"], "good": []}
     told = noise_ablation.summary(made_up({INFERRED: 0.5, "good": 1.0}))
     assert "low: fewer right than good" in told["not_met"] and "right in low noise: 0.5" in told["not_met"]
+
+
+def test_images_of_one_object_are_one_case_over_objects():
+    """A win on thirty images of one of two objects is sure over images, and nothing over objects."""
+    rows = made_up({INFERRED: 1.0, "bad": 0.25})
+    rows = [row | {"object": "a" if row["seed"] >= 10 else "b"} for row in rows]
+    told = noise_ablation.summary(rows)["low: bad"]
+    assert told["p_inferred_better"] < 1e-8 and told["p_objects_better"] == 0.5
+    assert (told["objects_better"], told["objects_worse"]) == (1, 0)
+    assert told["gain"][1] > 0.5 and told["object_gain"][1] == 0 and told["object_gain"][0] == told["gain"][0]
 
 
 def test_pictures_and_lines(tmp_path):
@@ -117,6 +127,7 @@ def test_pictures_and_lines(tmp_path):
 
 
 def test_steps_are_those_that_are_counted():
-    assert noise_ablation.count(False) == len(LEVELS) * len(OBJECTS) * noise_ablation.SEEDS
+    assert noise_ablation.count(False) == len(LEVELS) * len(OBJECTS) * len(noise_ablation.SEEDS)
+    assert 0 not in noise_ablation.SEEDS  # which chose a setting
     assert len(OBJECTS) == 19 and all(noise in CLAMPED for noise in LEVELS.values())
     assert len(noise_ablation.cells(True)) == noise_ablation.count(True)

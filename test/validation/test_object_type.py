@@ -96,13 +96,18 @@ def test_summary_lines_and_picture(tmp_path):
     assert told["as trained: Bayes3D"]["calibration_error"] == pytest.approx(0.2)
     assert told["not_met"] == [f"{kind}: calibration error 0.200" for kind in ("as trained", "poses off")]
     assert told["as trained: Bayes3D"]["clipped"] == 0
+    assert told["as trained: network 10"]["in sight"] == [pytest.approx(-np.log(0.55), abs=1e-4), 60]
+    parts = made_up(PARSER, 0, 0.8) | {"visible": [0.0] * 30 + [0.02] * 10 + [0.4] * 20}
+    assert {key: value[1] for key, value in object_type.summary([parts])["as trained: Bayes3D"].items()
+            if isinstance(value, list)} == {"hidden": 30, "a part in sight": 10, "in sight": 20}  # fmt: skip
     sure = [made_up(PARSER, 0, 0.0) | {"failed": 2, "others": 1, "largest_file_bytes": 16_001} for _ in range(2)]
     wrong = object_type.summary(sure)
     assert {key: wrong["as trained: Bayes3D"][key] for key in ("clipped", "failed", "others")} == {
         "clipped": 120, "failed": 4, "others": 2,
     }  # fmt: skip
     assert wrong["not_met"][-1] == "a file of 16001 bytes"
-    rows.append(made_up(object_type.ENSEMBLE, 10, 0.85))
+    rows.append(made_up(object_type.ENSEMBLE, 10, 0.85) | {"member_log_losses": [0.2, 0.3]})
+    assert object_type.summary(rows)["as trained: network (ensemble) 10"]["member_log_losses"] == [0.2, 0.3]
     assert object_type.summary(rows)["network_needs"]["as trained"] == 10
     paths = object_type.plot(rows, tmp_path)
     assert [path.suffix for path in paths] == [".pdf", ".png"] and all(path.stat().st_size > 1000 for path in paths)

@@ -138,7 +138,8 @@ def test_claims_read_summaries_as_experiments_write_them() -> None:
     assert scenes_right("meshes", dark) is None
     sizes = {"file_bytes": 20_000, "memory_bytes": 40_000}
     kinds = [
-        {"method": method, "training": size, "test": test, "p": [p, 1 - p], "truth": [1, 0], **sizes}
+        {"method": method, "training": size, "test": test, "p": [p, 1 - p], "truth": [1, 0], "visible": [1.0, 1.0]}
+        | sizes
         for method, size, p in (("Bayes3D", 0, 0.9), ("network", 10, 0.6), ("network", 300, 0.95))
         for test in ("as trained", "poses off")
     ]

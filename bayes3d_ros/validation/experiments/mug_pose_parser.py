@@ -20,7 +20,7 @@ from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.settings import LearnerSettings, ParserSettings
 from bayes3d_ros.validation.experiments import Row
 from bayes3d_ros.validation.experiments.mug_pose_summary import PARSER
-from bayes3d_ros.validation.experiments.mug_pose_truth import GROUP, Truth, mug_row, von_mises_scores
+from bayes3d_ros.validation.experiments.mug_pose_truth import GROUP, Truth, mug_row
 from bayes3d_ros.validation.networks import von_mises
 from bayes3d_ros.validation.reference.exact_yaw import yaw_axis
 from bayes3d_ros.validation.simulate.capture_views import capture
@@ -104,9 +104,9 @@ def parser_rows(
             yaw_scores(kernel_density(one), axis, exact, yaw)
             for one, exact, yaw in zip(said, own.posterior, own.images.yaw, strict=True)
         ]
-        fits = [von_mises.fit(one.yaw, one.weight) for one in said]
+        fits = [von_mises.Mixture((von_mises.fit(one.yaw, one.weight),)) for one in said]
         rows.append(
-            mug_row(step.method, step.views, condition, von_mises_scores(fits, own), [own])
+            mug_row(step.method, step.views, condition, fits, [own])
             | {"samples_cross_entropy": [round(s.cross_entropy, 4) for s in samples]}
             | {"samples_log_p_true": [round(s.log_p_true, 4) for s in samples]}
             | {"failed": sum(one is None for one in found), "seconds": round(seconds, 2)}

@@ -3,6 +3,7 @@
 """Test images of the mug-pose experiment, their exact posteriors, and what a row says of them."""
 
 from collections.abc import Callable, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ def group_truth(
     return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]), handle)
 
 
-def von_mises_scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], truth: Truth) -> list[YawScores]:
+def _scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], truth: Truth) -> list[YawScores]:
     axis = yaw_axis(truth.posterior.shape[1])
     return [
         yaw_scores(q.log_density, axis, exact, yaw)
@@ -51,23 +52,43 @@ def von_mises_scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], tru
     ]
 
 
-def mug_row(method: str, size: int, condition: str, scores: Sequence[YawScores], groups: Sequence[Truth]) -> Row:
-    """A value an image in each list: of the von Mises, with its standard deviation in degrees; then the exact
-    posterior's own entropy and standard deviation, the cross-entropy of the best von Mises that there is, and the share
-    of the handle in sight."""
-    best = [s.cross_entropy for truth in groups for s in von_mises_scores(_best_fits(truth), truth)]
-    return {
+def mug_row(method: str, size: int, condition: str, said: Sequence[von_mises.Mixture], groups: Sequence[Truth]) -> Row:
+    """A value an image in each list: of what a method said of it (`von_mises`: mean in radians and concentration of
+    each member), with `sd`, its standard deviation in degrees; `floored` is the cross-entropy where a hundredth of the
+    density is uniform, as it is of samples. Then the true `yaw`, the exact posterior's own entropy and standard
+    deviation, the cross-entropy of the best von Mises that there is, and the share of the handle in sight."""
+    rest = iter(said)
+    scores = [s for truth in groups for s in _scores(list(islice(rest, len(truth.posterior))), truth)]
+    best = [s.cross_entropy for truth in groups for s in _scores(_best_fits(truth), truth)]
+    row = {
         "method": method,
         "training": size,
         "test": condition,
+        "von_mises": [[[round(m, 5), float(f"{k:.5g}")] for m, k in one.members] for one in said],
         "cross_entropy": [round(s.cross_entropy, 4) for s in scores],
+        "floored": [round(s.floored, 4) for s in scores],
         "log_p_true": [round(s.log_p_true, 4) for s in scores],
         "sd": [round(s.sd, 3) for s in scores],
+        "yaw": [round(float(yaw), 5) for truth in groups for yaw in truth.images.yaw],
         "entropy": [round(entropy(exact), 4) for truth in groups for exact in truth.posterior],
         "exact_sd": [round(circular_sd(yaw_axis(len(p)), p), 3) for truth in groups for p in truth.posterior],
         "handle": [round(float(share), 3) for truth in groups for share in truth.handle],
         "best_von_mises": [round(value, 4) for value in best],
     }
+    if len(said[0].members) > 1:
+        row["member_cross_entropy"] = _member_means(said, groups)
+    return row
+
+
+def _member_means(said: Sequence[von_mises.Mixture], groups: Sequence[Truth]) -> list[float]:
+    """The mean cross-entropy of each member on its own."""
+    posteriors = [exact for truth in groups for exact in truth.posterior]
+    axis = yaw_axis(len(posteriors[0]))
+    each = np.array([
+        [-(exact * member.log_density(axis)).sum() for member in one.members]
+        for one, exact in zip(said, posteriors, strict=True)
+    ])  # fmt: skip
+    return [round(float(mean), 4) for mean in each.mean(0)]
 
 
 def _best_fits(truth: Truth) -> list[von_mises.VonMises]:

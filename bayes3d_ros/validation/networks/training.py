@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Training with early stopping on a held-out share, at several learning rates of which the best is kept."""
+"""Training with early stopping on images held out, at several learning rates of which the best is kept.
+
+Where images are few, a fifth of them says little: each fifth is then held out in turn, which chooses the learning rate
+and the number of steps, and the network that is kept is trained so on all of them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from bayes3d_ros.validation.networks.augmentation import Augmentation, augmented
 from bayes3d_ros.validation.networks.models import DepthNetwork
@@ -24,18 +28,22 @@ _PREDICTED = 128  # images at once: one shape is compiled for sets of all sizes
 class TrainingPlan(NamedTuple):
     """How long and how fast."""
 
-    rates: tuple[float, ...] = (3e-4, 1e-3)  # of AdamW
+    rates: tuple[float, ...] = (3e-4, 1e-3, 3e-3)  # of AdamW
     batch: int = 64
-    most_steps: int = 6000
-    check_every: int = 50  # steps between looks at the validation images
-    patience: int = 12  # looks without a better loss, after which training stops
-    validation: float = 0.2  # share of the images
+    most_steps: int = 8000
+    look_every: int = 10  # steps between looks at the images held out; a tenth of the steps so far, if these are more
+    patience: int = 300  # steps without a better loss, after which training stops; as many as the best took, if more
+    validation: float = 0.2  # share of the images that is held out
+    cross_validated: int = 100  # fewer images than this are held out in turn
     decay: float = 1e-4
     augmentation: Augmentation | None = None  # of the images that are trained on
 
 
+QUICK_PLAN = TrainingPlan(rates=(1e-3,), most_steps=60, look_every=20, cross_validated=0)
+
+
 class Look(NamedTuple):
-    """How far a network has come. Nats."""
+    """How far a network has come; of images that are held out in turn, means of all networks. Nats."""
 
     step: int
     training_loss: float  # mean of the batches since the last look
@@ -52,6 +60,19 @@ class Trained(NamedTuple):
     validation_loss: float
     seconds: float  # of all learning rates
     looks: tuple[Look, ...] = ()  # at the learning rate that was chosen
+    capped: bool = False  # whether `most_steps` ended the training, at this rate
+
+
+class Method(NamedTuple):
+    """What a step is compiled for: it is the same at all learning rates."""
+
+    loss: Loss
+    decay: float
+
+    @property
+    def adam(self) -> optax.GradientTransformation:
+        """AdamW (Loshchilov and Hutter 2019), before the learning rate."""
+        return optax.chain(optax.scale_by_adam(), optax.add_decayed_weights(self.decay))
 
 
 def train_best(
@@ -64,18 +85,37 @@ def train_best(
 ) -> Trained:
     """Train from the same start at every learning rate. The same arguments give the same network on one machine.
 
-    The last `validation` share of the images, at least one, is held out: their order has to be random. Raises
-    ValueError where there are fewer than two images.
+    The order of the images has to be random: the last ones are held out. Raises ValueError where there are fewer than
+    two images.
     """
     if len(images) < 2:
         raise ValueError(f"expected at least two images to train on, got {len(images)}")
-    held = max(1, round(plan.validation * len(images)))
-    train, held_out = (images[:-held], targets[:-held]), (images[-held:], targets[-held:])
     start = time.perf_counter()
-    tried = [_train(network, train, held_out, loss, plan._replace(rates=(rate,)), seed) for rate in plan.rates]
+    held_out = _held_out(len(images), plan)
+    method = Method(loss, plan.decay)
+    tried = [_train(network, (images, targets), held_out, method, plan, rate, seed) for rate in plan.rates]
     best = min(tried, key=lambda one: one.validation_loss)
-    last = float(mean_loss(best.network, *train, loss))
+    if len(held_out) > 1:
+        kept = np.arange(len(images))
+        if best.steps:
+            steps = _steps(network, (images, targets), method, plan, best.rate, seed)
+            trained, _ = next(islice(steps, best.steps - 1, None))
+            best = best._replace(network=trained)
+    else:
+        kept = _others(len(images), held_out[0])
+    last = mean_loss(best.network, images[kept], targets[kept], loss)
     return best._replace(training_loss=last, seconds=time.perf_counter() - start)
+
+
+def _held_out(count: int, plan: TrainingPlan) -> list[Int[np.ndarray, "H"]]:
+    """Which images are held out: the last ones, or (of few images) every part in turn."""
+    if count < plan.cross_validated:
+        return np.array_split(np.arange(count), min(count, round(1 / plan.validation)))
+    return [np.arange(count - max(1, round(plan.validation * count)), count)]
+
+
+def _others(count: int, held_out: Int[np.ndarray, "H"]) -> Int[np.ndarray, "T"]:
+    return np.setdiff1d(np.arange(count), held_out)
 
 
 def predictions(
@@ -96,43 +136,60 @@ def mean_loss(network: DepthNetwork, images: np.ndarray, targets: np.ndarray, lo
 
 
 def _train(
-    network: DepthNetwork, train: LabelledImages, held_out: LabelledImages, loss: Loss, plan: TrainingPlan, seed: int
+    network: DepthNetwork,
+    labelled: LabelledImages,
+    held_out: Sequence[Int[np.ndarray, "H"]],
+    method: Method,
+    plan: TrainingPlan,
+    rate: float,
+    seed: int,
 ) -> Trained:
-    """At one learning rate. Batches are drawn with replacement: one shape is compiled for sets of all sizes."""
-    images, targets = train
-    (rate,) = plan.rates
-    method = Method(loss, plan.decay)
+    """At one learning rate. Where several parts are held out in turn, a network for each takes its steps beside the
+    others, looks are at all together, and the network that is returned is the first one's."""
+    images, targets = labelled
+    runs = []
+    for part in held_out:
+        others = _others(len(images), part)
+        runs.append(_steps(network, (images[others], targets[others]), method, plan, rate, seed))
+
+    def validation_loss(networks: Sequence[DepthNetwork]) -> float:
+        each = zip(networks, held_out, strict=True)
+        total = sum(len(part) * mean_loss(one, images[part], targets[part], method.loss) for one, part in each)
+        return total / sum(map(len, held_out))
+
+    best = Trained(network, rate, 0, np.nan, validation_loss([network] * len(runs)), 0.0)
+    looks: list[Look] = []
+    losses: list[Array] = []
+    next_look = plan.look_every
+    for step in range(1, plan.most_steps + 1):
+        networks, means = zip(*(next(run) for run in runs), strict=True)
+        losses += means
+        if step < next_look and step < plan.most_steps:
+            continue
+        now = validation_loss(networks)
+        looks.append(Look(step, float(np.mean(jax.device_get(losses))), now))
+        losses, next_look = [], step + max(plan.look_every, step // 10)
+        if now < best.validation_loss:
+            best = best._replace(network=networks[0], steps=step, validation_loss=now)
+        if step - best.steps >= max(plan.patience, best.steps) or not np.isfinite(now):
+            return best._replace(looks=tuple(looks))
+    return best._replace(looks=tuple(looks), capped=True)
+
+
+def _steps(
+    network: DepthNetwork, labelled: LabelledImages, method: Method, plan: TrainingPlan, rate: float, seed: int
+) -> Iterator[tuple[DepthNetwork, Array]]:
+    """The network after each step, and the mean loss of the step's images before it. Images are drawn with
+    replacement: one shape is compiled for sets of all sizes."""
+    images, targets = labelled
     state = method.adam.init(eqx.filter(network, eqx.is_inexact_array))
     rng, changes = np.random.default_rng(seed), np.random.default_rng((seed, 1))
-    best = Trained(network, rate, 0, np.nan, mean_loss(network, *held_out, loss), 0.0)
-    worse, looks, losses = 0, [], []
-    for step in range(1, plan.most_steps + 1):
+    while True:
         drawn = rng.integers(len(images), size=plan.batch)
         seen = images[drawn] if plan.augmentation is None else augmented(images[drawn], plan.augmentation, changes)
         batch = jnp.asarray(seen), jnp.asarray(targets[drawn])
         network, state, mean = _step(network, state, batch, jnp.float32(rate), method)
-        losses.append(mean)
-        if step % plan.check_every == 0:
-            now = mean_loss(network, *held_out, loss)
-            looks.append(Look(step, float(np.mean(jax.device_get(losses))), now))
-            worse, losses = worse + 1, []
-            if now < best.validation_loss:
-                best, worse = best._replace(network=network, steps=step, validation_loss=now), 0
-            if worse >= plan.patience or not np.isfinite(now):
-                break
-    return best._replace(looks=tuple(looks))
-
-
-class Method(NamedTuple):
-    """What a step is compiled for: it is the same at all learning rates."""
-
-    loss: Loss
-    decay: float
-
-    @property
-    def adam(self) -> optax.GradientTransformation:
-        """AdamW (Loshchilov and Hutter 2019), before the learning rate."""
-        return optax.chain(optax.scale_by_adam(), optax.add_decayed_weights(self.decay))
+        yield network, mean
 
 
 @eqx.filter_jit

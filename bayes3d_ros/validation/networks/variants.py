@@ -32,12 +32,14 @@ def train_variant(
     plan: TrainingPlan,
     seed: int,
 ) -> list[Trained]:
-    """Its members, each as `train_best` trains it."""
+    """Its members, each as `train_best` trains it; the first chooses the learning rate of all."""
     plan = plan._replace(augmentation=variant.augmentation)
-    members = [
-        DepthNetwork(variant.network, images.shape[1:], outputs, jax.random.key(k)) for k in range(variant.members)
-    ]
-    return [train_best(one, images, targets, loss, plan, seed + 1000 * k) for k, one in enumerate(members)]
+    members: list[Trained] = []
+    for k in range(variant.members):
+        network = DepthNetwork(variant.network, images.shape[1:], outputs, jax.random.key(k))
+        members.append(train_best(network, images, targets, loss, plan, seed + 1000 * k))
+        plan = plan._replace(rates=(members[0].rate,))
+    return members
 
 
 def predictions_of(
@@ -61,5 +63,6 @@ def training_told(members: Sequence[Trained]) -> dict[str, Any]:
         "steps": first.steps,
         "training_loss": round(float(np.mean([one.training_loss for one in members])), 5),
         "validation_loss": round(float(np.mean([one.validation_loss for one in members])), 5),
+        "capped": any(one.capped for one in members),
         "looks": [[look.step, round(look.training_loss, 4), round(look.validation_loss, 4)] for look in first.looks],
     }

@@ -22,6 +22,7 @@ class YawScores(NamedTuple):
     """Of a density q of the yaw of one image; nats."""
 
     cross_entropy: float  # from the exact posterior
+    floored: float  # the same of q of which a share of ANYWHERE is uniform
     log_p_true: float  # log q(true yaw)
     sd: float  # degrees, circular
 
@@ -30,7 +31,10 @@ def yaw_scores(q: LogDensity, axis: Float[np.ndarray, "K"], exact: Float[np.ndar
     """exact: probabilities of the yaws on the axis, radians."""
     log_q = q(axis)
     spread = circular_sd(axis, np.exp(log_q - np.logaddexp.reduce(log_q)))
-    return YawScores(float(-(exact * log_q).sum()), float(q(np.array([yaw]))[0]), spread)
+    floored = np.logaddexp(np.log1p(-ANYWHERE) + log_q, np.log(ANYWHERE / (2 * np.pi)))
+    return YawScores(
+        float(-(exact * log_q).sum()), float(-(exact * floored).sum()), float(q(np.array([yaw]))[0]), spread
+    )
 
 
 def circular_sd(axis: Float[np.ndarray, "K"], p: Float[np.ndarray, "K"]) -> float:
