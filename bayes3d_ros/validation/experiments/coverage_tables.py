@@ -193,16 +193,18 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     axis.axhspan(*LIMITS[1.0], color=GREY, alpha=0.2, linewidth=0, label="wanted up to x 2")
     axis.axhline(LIMITS[3.0][0], color=GREY, linewidth=1, linestyle=":", label="wanted at x 3")
     told = summary(rows)
+    lowest = LIMITS[3.0][0]
     for k, name in enumerate(QUANTITIES):
         there = [(a, told[key]["coverage_90"]) for a in AMPLITUDES if (key := f"x {a:g}: {name}") in told]
         style = "--" if name in RELATIVE else "-"
+        lowest = min([lowest, *(share for _, share in there)])
         axis.plot(
             [a for a, _ in there], [share for _, share in there], style, marker="o", color=colour(k + 1), label=name
         )
-    axis.set(ylim=(0, 1))
+    axis.set(ylim=(max(0.0, lowest - 0.05), 1.005))
     open_frame(axis)
     label_plot(axis, "size of the errors, of those that the settings are for", "truth within the 90 % region", "")
-    axis.legend(fontsize=8, frameon=False, loc="lower left", ncols=3)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right upper", fontsize=8, frameon=False)
     path = folder / "coverage-tables.png"
     figure.savefig(path, dpi=110)
     return [path]
