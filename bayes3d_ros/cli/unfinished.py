@@ -57,8 +57,8 @@ def set_aside(file: Path) -> Path | None:
         earlier = json.loads(file.read_text())
     except FileNotFoundError:
         return None
-    except (ValueError, RecursionError):
-        earlier = None  # damaged: still somebody's file
+    except (PermissionError, ValueError, RecursionError):
+        earlier = None  # damaged, or not readable: still somebody's file
     if isinstance(earlier, dict) and not earlier.get("rows"):
         return None
     return file.replace(file.with_name(f"{file.name}~"))

@@ -3,7 +3,6 @@
 """Test images of the mug-pose experiment, their exact posteriors, and what a row says of them."""
 
 from collections.abc import Callable, Sequence
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -44,11 +43,12 @@ def group_truth(
     return Truth(images, np.array([yaw_posterior(depth, clean, drawn.noise) for depth in images.depth]), handle)
 
 
-def _scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], truth: Truth) -> list[YawScores]:
-    axis = yaw_axis(truth.posterior.shape[1])
+def _scores(said: Sequence[von_mises.VonMises | von_mises.Mixture], groups: Sequence[Truth]) -> list[YawScores]:
+    """Of what is said of every image of all groups."""
+    images = ((exact, yaw) for truth in groups for exact, yaw in zip(truth.posterior, truth.images.yaw, strict=True))
     return [
-        yaw_scores(q.log_density, axis, exact, yaw)
-        for q, exact, yaw in zip(said, truth.posterior, truth.images.yaw, strict=True)
+        yaw_scores(q.log_density, yaw_axis(len(exact)), exact, yaw)
+        for q, (exact, yaw) in zip(said, images, strict=True)
     ]
 
 
@@ -57,9 +57,8 @@ def mug_row(method: str, size: int, condition: str, said: Sequence[von_mises.Mix
     each member), with `sd`, its standard deviation in degrees; `floored` is the cross-entropy where a hundredth of the
     density is uniform, as it is of samples. Then the true `yaw`, the exact posterior's own entropy and standard
     deviation, the cross-entropy of the best von Mises that there is, and the share of the handle in sight."""
-    rest = iter(said)
-    scores = [s for truth in groups for s in _scores(list(islice(rest, len(truth.posterior))), truth)]
-    best = [s.cross_entropy for truth in groups for s in _scores(_best_fits(truth), truth)]
+    scores = _scores(said, groups)
+    best = [s.cross_entropy for s in _scores([fit for truth in groups for fit in _best_fits(truth)], groups)]
     row = {
         "method": method,
         "training": size,
@@ -76,19 +75,9 @@ def mug_row(method: str, size: int, condition: str, said: Sequence[von_mises.Mix
         "best_von_mises": [round(value, 4) for value in best],
     }
     if len(said[0].members) > 1:
-        row["member_cross_entropy"] = _member_means(said, groups)
+        alone = [_scores(member, groups) for member in zip(*(one.members for one in said), strict=True)]
+        row["member_cross_entropy"] = [round(float(np.mean([s.cross_entropy for s in own])), 4) for own in alone]
     return row
-
-
-def _member_means(said: Sequence[von_mises.Mixture], groups: Sequence[Truth]) -> list[float]:
-    """The mean cross-entropy of each member on its own."""
-    posteriors = [exact for truth in groups for exact in truth.posterior]
-    axis = yaw_axis(len(posteriors[0]))
-    each = np.array([
-        [-(exact * member.log_density(axis)).sum() for member in one.members]
-        for one, exact in zip(said, posteriors, strict=True)
-    ])  # fmt: skip
-    return [round(float(mean), 4) for mean in each.mean(0)]
 
 
 def _best_fits(truth: Truth) -> list[von_mises.VonMises]:

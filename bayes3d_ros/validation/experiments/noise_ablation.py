@@ -223,8 +223,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 def _against(inferred: Sequence[Row], clamped: Sequence[Row]) -> Row:
     """What a summary says of a clamped prior beside the inferred one; rows of the same images in the same order."""
     right, theirs = (np.array([row["right"] for row in rows]) for rows in (inferred, clamped))
-    names = sorted({row["object"] for row in inferred})
-    thing = np.array([names.index(row["object"]) for row in inferred])
+    _, thing = np.unique([row["object"] for row in inferred], return_inverse=True)
     more = np.bincount(thing, right.astype(float) - theirs)
     images, objects = mcnemar(right, theirs), mcnemar(more > 0, more < 0)
     scores, apart = (log_scores(inferred), log_scores(clamped)), 1 - 2 * SIGNIFICANT

@@ -31,10 +31,8 @@ def yaw_scores(q: LogDensity, axis: Float[np.ndarray, "K"], exact: Float[np.ndar
     """exact: probabilities of the yaws on the axis, radians."""
     log_q = q(axis)
     spread = circular_sd(axis, np.exp(log_q - np.logaddexp.reduce(log_q)))
-    floored = np.logaddexp(np.log1p(-ANYWHERE) + log_q, np.log(ANYWHERE / (2 * np.pi)))
-    return YawScores(
-        float(-(exact * log_q).sum()), float(-(exact * floored).sum()), float(q(np.array([yaw]))[0]), spread
-    )
+    own, floored = (-float((exact * log_p).sum()) for log_p in (log_q, _floored(np.exp(log_q))))
+    return YawScores(own, floored, float(q(np.array([yaw]))[0]), spread)
 
 
 def circular_sd(axis: Float[np.ndarray, "K"], p: Float[np.ndarray, "K"]) -> float:
@@ -68,11 +66,11 @@ def kernel_density(samples: WeightedYaws) -> LogDensity:
     apart = np.cos(samples.yaw[:, None] - samples.yaw)
     others = np.where(samples.draw[:, None] != samples.draw, samples.weight, 0.0)
     others /= np.maximum(others.sum(1, keepdims=True), np.finfo(float).tiny)
-    fits = [samples.weight @ _blurred((_kernel(apart, width) * others).sum(1)) for width in KERNELS]
+    fits = [samples.weight @ _floored((_kernel(apart, width) * others).sum(1)) for width in KERNELS]
     width = KERNELS[int(np.argmax(fits))]
 
     def log_density(angle: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-        return _blurred(_kernel(np.cos(angle[:, None] - samples.yaw), width) @ samples.weight)
+        return _floored(_kernel(np.cos(angle[:, None] - samples.yaw), width) @ samples.weight)
 
     return log_density
 
@@ -83,6 +81,6 @@ def _kernel(cosine: Float[np.ndarray, "*shape"], width: float) -> Float[np.ndarr
     return np.exp(k * (cosine - 1)) / (2 * np.pi * i0e(k))
 
 
-def _blurred(density: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+def _floored(density: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
     """Nats, with the share that is uniform."""
     return np.log((1 - ANYWHERE) * density + ANYWHERE / (2 * np.pi))
