@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem
+from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of, fit_planes
 
 MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
-SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
-LEAST_BACK = 0.2  # of a voxel's face: the area of a wall's second side in a voxel from which it has a plane
-_SAME_SHEET = -0.3  # cosine between normals of one sheet and of a voxel's plane, at least
-REACH = 0.15  # a voxel's plane serves its cube inflated by this fraction of a voxel on every side
+_SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
+_LEAST_BACK = 0.2  # of a voxel's face: the area of a wall's second side in a voxel from which it has a plane
+_REACH = 0.15  # a voxel's plane serves its cube inflated by this fraction of a voxel on every side
 
 
 class VoxelSolid(NamedTuple):
@@ -54,7 +54,7 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
         raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; {remedy}")
     shape = shape.astype(int)
     origin = (low + high) / 2 - shape * voxel_size / 2
-    samples = sample_surface(mesh, voxel_size / SAMPLES_PER_EDGE)
+    samples = sample_surface(mesh, voxel_size / _SAMPLES_PER_EDGE)
     if mesh.volume < 0:  # wound inside out
         samples = samples._replace(normals=-samples.normals)
     patches = fit_planes(samples, origin, voxel_size, tuple(shape.tolist()))
@@ -75,71 +75,6 @@ def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z
     return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
-class Patches(NamedTuple):
-    """The piece of surface in every voxel that has one, in C order of the voxels."""
-
-    voxel: Int[np.ndarray, "S 3"]
-    normal: Float[np.ndarray, "S 3"]
-    offset: Float[np.ndarray, "S"]  # metres from the voxel's centre, along the normal
-    centroid: Float[np.ndarray, "S 3"]  # metres from the voxel's centre
-    area: Float[np.ndarray, "S"]  # square metres
-
-
-def fit_planes(
-    samples: SurfaceSamples, origin: Float[np.ndarray, "3"], voxel_size: float, shape: tuple[int, ...]
-) -> Patches:
-    """A plane in every voxel that holds a sample, fitted to the samples in and closely around the voxel.
-
-    Samples are weighted by a Gaussian around the centroid of those in the voxel, so that planes of neighbours agree.
-    Where two sheets of a thin wall share a voxel, the plane is that of the sheet with more area in it.
-    """
-    position = (samples.points - origin) / voxel_size
-    cell = _cells(position, shape)
-    keys, row = np.unique(np.ravel_multi_index(tuple(cell.T), shape), return_inverse=True)
-    index = np.stack(np.unravel_index(keys, shape), 1)
-    count = len(keys)
-    row_of = np.full(np.array(shape) + 2, -1)
-    row_of[tuple(index.T + 1)] = np.arange(count)
-
-    reference = _reference_normals(samples.normals, row, count)
-    same = np.einsum("ij,ij->i", samples.normals, reference[row]) > _SAME_SHEET
-    ones = same.astype(float)
-    number = np.bincount(row, ones, count)
-    centroid = np.stack([np.bincount(row, ones * position[:, i], count) for i in range(3)], 1) / number[:, None]
-
-    width = 0.35
-    total, first, second = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    mean_normal = np.zeros((count, 3))
-    side = np.where(position - cell < 0.5, -1, 1)  # the 8 voxels whose half-voxel surroundings hold the sample
-    for step in itertools.product((0, 1), repeat=3):
-        target = row_of[tuple((cell + side * step + 1).T)]
-        sample = np.flatnonzero(target >= 0)
-        target = target[sample]
-        away = position[sample] - centroid[target]
-        agree = np.einsum("ij,ij->i", samples.normals[sample], reference[target])
-        weight = np.exp(-(away**2).sum(1) / (2 * width**2)) * (agree > _SAME_SHEET)
-        total += np.bincount(target, weight, count)
-        for i in range(3):
-            first[:, i] += np.bincount(target, weight * away[:, i], count)
-            mean_normal[:, i] += np.bincount(target, weight * samples.normals[sample, i], count)
-            for j in range(i + 1):
-                second[:, i, j] += np.bincount(target, weight * away[:, i] * away[:, j], count)
-    mean = first / total[:, None]
-    covariance = second / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
-    normal = np.linalg.eigh(covariance)[1][:, :, 0]  # reads the lower triangle
-    normal *= np.where(np.einsum("ij,ij->i", normal, mean_normal) < 0, -1.0, 1.0)[:, None]
-    local = centroid + mean - index - 0.5
-    limit = np.sqrt(3) / 2
-    offset = np.clip(np.einsum("ij,ij->i", normal, local), -limit, limit)
-    area = np.bincount(row, minlength=count) * samples.area
-    return Patches(index, normal, offset * voxel_size, (centroid - index - 0.5) * voxel_size, area)
-
-
-def _cells(position: Float[np.ndarray, "N 3"], shape: tuple[int, ...]) -> Int[np.ndarray, "N 3"]:
-    """The voxels that hold these points, in voxels from the grid's origin."""
-    return np.clip(np.floor(position).astype(int), 0, np.array(shape) - 1)
-
-
 def _back_sheets(
     samples: SurfaceSamples,
     front: Patches,
@@ -150,28 +85,15 @@ def _back_sheets(
     """Of voxels that hold both sides of a thin wall, the side that `front` does not have."""
     row_of = np.full(shape, -1)
     row_of[tuple(front.voxel.T)] = np.arange(len(front.voxel))
-    row = row_of[tuple(_cells((samples.points - origin) / voxel_size, shape).T)]
-    behind = (row >= 0) & (np.einsum("ij,ij->i", samples.normals, front.normal[row]) <= _SAME_SHEET)
+    row = row_of[tuple(cells_of((samples.points - origin) / voxel_size, shape).T)]
+    behind = (row >= 0) & (np.einsum("ij,ij->i", samples.normals, front.normal[row]) <= SAME_SHEET)
     if not behind.any():
         return Patches(*(part[:0] for part in front))
     others = samples._replace(points=samples.points[behind], normals=samples.normals[behind])
     back = fit_planes(others, origin, voxel_size, shape)
     facing = np.einsum("ij,ij->i", back.normal, front.normal[row_of[tuple(back.voxel.T)]])
-    found = (back.area > LEAST_BACK * voxel_size**2) & (facing <= _SAME_SHEET)
+    found = (back.area > _LEAST_BACK * voxel_size**2) & (facing <= SAME_SHEET)
     return Patches(*(part[found] for part in back))
-
-
-def _reference_normals(
-    normals: Float[np.ndarray, "N 3"], row: Int[np.ndarray, "N"], count: int
-) -> Float[np.ndarray, "S 3"]:
-    """The side that a voxel's surface faces. Where two sheets face opposite sides, the larger one's."""
-    number = np.bincount(row, minlength=count)
-    mean = np.stack([np.bincount(row, normals[:, i], count) for i in range(3)], 1) / number[:, None]
-    outer = np.stack([np.bincount(row, normals[:, i] * normals[:, j], count) for i in range(3) for j in range(3)], 1)
-    axis = np.linalg.eigh(outer.reshape(-1, 3, 3))[1][:, :, 2]
-    axis *= np.where(np.einsum("ij,ij->i", axis, mean) < 0, -1.0, 1.0)[:, None]
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    return np.where(length > 0.5, mean / np.maximum(length, 1e-12), axis)
 
 
 def _redundant(patches: Patches, voxel_size: float, shape: tuple[int, ...]) -> Bool[np.ndarray, "S"]:
@@ -185,7 +107,7 @@ def _redundant(patches: Patches, voxel_size: float, shape: tuple[int, ...]) -> B
             continue
         neighbour = row_of[tuple((patches.voxel[small] + 1 + step).T)]
         seen = patches.centroid[small] - np.array(step) * voxel_size  # from the neighbour's centre
-        within = (np.abs(seen) < (0.5 + REACH) * voxel_size).all(1)
+        within = (np.abs(seen) < (0.5 + _REACH) * voxel_size).all(1)
         miss = np.abs(np.einsum("ij,ij->i", patches.normal[neighbour], seen) - patches.offset[neighbour])
         larger = patches.area[neighbour] > 2 * patches.area[small]
         redundant[small] |= (neighbour >= 0) & within & larger & (miss < 0.05 * voxel_size)

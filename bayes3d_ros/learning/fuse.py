@@ -19,7 +19,8 @@ from scipy.spatial import ConvexHull, QhullError
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import SurfaceSamples
-from bayes3d_ros.geometry.voxels import Patches, VoxelSolid, fit_planes
+from bayes3d_ros.geometry.planes import Patches, fit_planes
+from bayes3d_ros.geometry.voxels import VoxelSolid
 from bayes3d_ros.learning.fusion_constants import BEHIND_VOXEL, FEWEST_VOXELS, FOOT, GLIMPSE, HIT, LOW, PASS, THIN
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.tuning import TUNING
