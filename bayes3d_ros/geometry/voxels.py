@@ -10,6 +10,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from bayes3d_ros.geometry.edges import EdgeVoxels, find_edges
 from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem
 from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of, fit_planes
 
@@ -31,6 +32,7 @@ class VoxelSolid(NamedTuple):
     back_index: Int[np.ndarray, "B 3"] = np.zeros((0, 3), int)
     back_normal: Float[np.ndarray, "B 3"] = np.zeros((0, 3))
     back_offset: Float[np.ndarray, "B"] = np.zeros(0)
+    back_concave: Bool[np.ndarray, "B"] = np.zeros(0, bool)
 
     @property
     def centre_of_mass(self) -> Float[np.ndarray, "3"]:
@@ -64,15 +66,48 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     drop = _redundant(patches, voxel_size, touched.shape)
     occupancy[tuple(patches.voxel[drop].T)] = patches.offset[drop] > 0  # where the centre lies behind the surface
     kept = Patches(*(part[~drop] for part in patches))
-    back = _back_sheets(samples, kept, origin, voxel_size, occupancy.shape)
-    surface = kept.voxel, kept.normal, kept.offset
-    return VoxelSolid(float(voxel_size), origin, occupancy, *surface, back.voxel, back.normal, back.offset)
+    front, second = two_planes(samples, kept, origin, voxel_size, occupancy.shape, bool(mesh.is_winding_consistent))
+    return VoxelSolid(float(voxel_size), origin, occupancy, front.voxel, front.normal, front.offset, *second)
 
 
 def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     """The surface voxels and all that no path of face neighbours from outside the grid can reach."""
     labels, _ = ndimage.label(~np.pad(surface, 1))
     return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
+
+
+class SecondPlanes(NamedTuple):
+    """Of voxels that hold two pieces of surface the smaller one, in C order of the voxels; fields as in VoxelSolid."""
+
+    voxel: Int[np.ndarray, "B 3"]
+    normal: Float[np.ndarray, "B 3"]
+    offset: Float[np.ndarray, "B"]
+    concave: Bool[np.ndarray, "B"]
+
+
+def two_planes(
+    samples: SurfaceSamples,
+    kept: Patches,
+    origin: Float[np.ndarray, "3"],
+    voxel_size: float,
+    shape: tuple[int, ...],
+    oriented: bool,
+) -> tuple[Patches, SecondPlanes]:
+    """The planes of voxels with a single piece of surface, and of the larger piece where there are two; and those of
+    the smaller pieces. oriented: whether normals agree on which side the solid is; else nothing meets at an edge."""
+    back = _back_sheets(samples, kept, origin, voxel_size, shape)
+    edges = find_edges(samples, kept, back, origin, voxel_size, shape)
+    edges = edges if oriented else EdgeVoxels(*(part[:0] for part in edges))
+    normal, offset = kept.normal.copy(), kept.offset.copy()
+    normal[edges.row], offset[edges.row] = edges.normal[:, 0], edges.offset[:, 0]
+    second = SecondPlanes(
+        np.concatenate([back.voxel, kept.voxel[edges.row]]),
+        np.concatenate([back.normal, edges.normal[:, 1]]),
+        np.concatenate([back.offset, edges.offset[:, 1]]),
+        np.concatenate([np.zeros(len(back.voxel), bool), edges.concave]),
+    )
+    order = np.lexsort(second.voxel.T[::-1])
+    return kept._replace(normal=normal, offset=offset), SecondPlanes(*(part[order] for part in second))
 
 
 def _back_sheets(

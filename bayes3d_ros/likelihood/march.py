@@ -3,7 +3,8 @@
 """The fast renderer: walk each ray through the voxel grid, skipping empty space, to the first plane it meets.
 
 What is rendered (`slow_renderer.py` renders the same): a surface voxel is hit where the ray, having entered its cube,
-meets its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it.
+meets its plane within that cube inflated by INFLATION; a voxel inside the solid is hit where the ray enters it. Where a
+voxel holds an edge, the solid is what lies behind both of its planes, or behind either (`at_edge`).
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Rays are followed within the object's box only, where planes would go on past its edges.
 Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
@@ -18,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from bayes3d_ros.objects.library_arrays import EMPTY, INFLATION, OFFSET_RANGE, LibraryArrays
+from bayes3d_ros.objects.library_arrays import EDGE, EMPTY, INFLATION, OFFSET_RANGE, LibraryArrays
 
 NEAREST_HIT = 0.05  # metres: nothing is met before
 _STEPS_OF_ALL_RAYS = 4  # of all rays alike
@@ -26,6 +27,7 @@ _STEPS_OF_ALL_RAYS = 4  # of all rays alike
 _STAGES = ((2, 4), (8, 8), (16, 96))
 MOST_STEPS = _STEPS_OF_ALL_RAYS + sum(steps for _, steps in _STAGES)
 NUDGE = 2e-3  # voxels, past a cube's face
+PASSED = -(128 << 24) + 0x010101  # the word of an empty voxel beside none that is empty
 NO_SURFACE = jnp.inf  # depth where a ray meets nothing
 
 
@@ -34,6 +36,7 @@ class Rays(NamedTuple):
     broadcasts against the rays."""
 
     first: Int[Array, "*shape"]  # of the words for directions of its octant
+    edges: Int[Array, "*objects"]  # of the words of planes that meet at edges
     dims: tuple[Float[Array, "*objects"], ...]
     origin: tuple[Float[Array, "*objects"], ...]
     direction: tuple[Float[Array, "*shape"], ...]
@@ -97,8 +100,9 @@ def enter_grid(
         enter = jnp.maximum(enter, jnp.minimum(low[a], high[a]))
         leave = jnp.minimum(leave, jnp.maximum(low[a], high[a]))
     octant = sum((c < 0).astype(jnp.int32) << bit for c, bit in zip(d, (2, 1, 0), strict=True))
-    first = first + octant * (dims[0] * dims[1] * dims[2]).astype(jnp.int32)  # below 2^24: exact
-    return Rays(first, tuple(dims), tuple(eye), tuple(d), leave), jnp.maximum(enter, near) + _nudge(d)
+    voxels = (dims[0] * dims[1] * dims[2]).astype(jnp.int32)  # below 2^24: exact
+    edges, first = first + 8 * voxels, first + octant * voxels
+    return Rays(first, edges, tuple(dims), tuple(eye), tuple(d), leave), jnp.maximum(enter, near) + _nudge(d)
 
 
 def depth_met(t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -162,6 +166,7 @@ def _picked(walk: Rays, index: Int[Array, "M"], leave: Float[Array, "R"]) -> Ray
 
     return Rays(
         first=objects(walk.first),
+        edges=objects(walk.edges),
         dims=tuple(map(objects, walk.dims)),
         origin=tuple(map(objects, walk.origin)),
         direction=tuple(objects(c) for c in walk.direction),
@@ -191,18 +196,40 @@ def advance(look_up: Callable, walk: Rays, t: Array, near: float) -> Array:
     cell = [jnp.clip(jnp.floor(a + at * c), 0.0, n - 1.0) for a, c, n in zip(o, d, dims, strict=True)]
     index = ((cell[0] * dims[1] + cell[1]) * dims[2] + cell[2]).astype(jnp.int32)  # below 2^24: exact
     word, cell = look_up(walk.first + index, cell)
-    empty = word < EMPTY
     from_centre = [a - c - 0.5 for a, c in zip(o, cell, strict=True)]
+    word = at_edge(look_up, word, walk.edges, from_centre, d)
+    empty = word < EMPTY
     sides = [((word >> shift) & 255).astype(jnp.float32) for shift in (16, 8, 0)]
     ahead = [jnp.where(empty, side - 0.5, 0.5) for side in sides]
     exits = [(jnp.where(c > 0, a, -a) - r) / c for a, c, r in zip(ahead, d, from_centre, strict=True)]
-    normal = [_byte(word, shift) for shift in (24, 16, 8)]
-    facing = sum(n * c for n, c in zip(normal, d, strict=True))
-    apart = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
-    meet = apart / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
+    meet, _ = _meet(word, from_centre, d)
     reach = [jnp.abs(r + meet * c) for r, c in zip(from_centre, d, strict=True)]
     on_plane = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2]) <= 0.5 + INFLATION
     inside = word == 0
     met = inside | (~empty & on_plane & (meet > near))
     beyond = jnp.maximum(jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2]), t) + _nudge(d)
     return jnp.where(active, jnp.where(met, -jnp.where(inside, t, meet), beyond), t)
+
+
+def _meet(word: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> tuple[Array, Array]:
+    """Where rays meet a word's plane, and whether they enter what lies behind it."""
+    normal = [_byte(word, shift) for shift in (24, 16, 8)]
+    facing = jnp.asarray(sum(n * c for n, c in zip(normal, d, strict=True)))
+    apart = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
+    return apart / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing), facing < 0
+
+
+def at_edge(look_up: Callable, word: Array, edges: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> Array:
+    """Of voxels that hold an edge the word of the plane in which rays enter the solid: what lies behind both planes, or
+    behind either where the edge is concave; that of an empty voxel where they do not. Other words as they are."""
+    edge = ((word >> 16) & 255 == EDGE) & (word >= EMPTY)
+    number = jnp.where(edge, ((word >> 24) + 127) << 16 | word & 0xFFFF, 0)
+    one, _ = look_up(edges + (number & ~1), [])
+    other, _ = look_up(edges + (number & ~1) + 1, [])
+    (meet_one, enters_one), (meet_other, enters_other) = (_meet(plane, from_centre, d) for plane in (one, other))
+    concave = number & 1 == 1
+    # Convex: entered at the later of two, or in the one that is met before the other is left.
+    takes_other = jnp.where(enters_one & enters_other, (meet_other < meet_one) == concave, enters_other)
+    into, out = jnp.where(enters_one, meet_one, meet_other), jnp.where(enters_one, meet_other, meet_one)
+    misses = jnp.where(enters_one != enters_other, ~concave & (into > out), ~enters_one)
+    return jnp.where(edge, jnp.where(misses, PASSED, jnp.where(takes_other, other, one)), word)

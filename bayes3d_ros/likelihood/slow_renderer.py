@@ -4,14 +4,15 @@
 through the object's box."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.objects.library_arrays import BOX_LOOSE, INFLATION
 from bayes3d_ros.objects.model import ObjectModel
-from bayes3d_ros.objects.thin_walls import octants, planes_met
+from bayes3d_ros.objects.second_planes import edge_planes, octants, planes_met
 
 _CORNER = 0.5 * np.sqrt(3.0) * (1 + 1e-9)  # voxels from the middle of a cube: no ray farther off enters it
 _RAYS_AT_A_TIME = 256  # rays, which bounds memory
@@ -33,10 +34,18 @@ def render(
     surface[tuple(model.surface_index.T)] = True
     depth = np.full(len(rays), np.inf)
     from_eye = model.surface_index + 0.5 - eye
-    (normal, offset), octant = planes_met(model), octants(directions)
+    (normal, offset), octant, edges = planes_met(model), octants(directions), edge_planes(model)
+    edge_of = np.full(len(from_eye), -1)
+    edge_of[edges.row] = np.arange(len(edges.row))
     for ray, cube in _pairs(from_eye, directions):
         plane = normal[octant[ray], cube], offset[octant[ray], cube] / model.voxel_size
-        np.minimum.at(depth, ray, _surface_hit(plane, from_eye[cube], directions[ray], way[ray], near))
+        first = _meet(plane, from_eye[cube], directions[ray])
+        edge, at = edge_of[cube], edge_of[cube] >= 0
+        plane = edges.normal[edge[at]], edges.offset[edge[at]] / model.voxel_size
+        second = _meet(plane, from_eye[cube[at]], directions[ray[at]])
+        meet = first[0]
+        meet[at] = _at_edge(Meeting(*(part[at] for part in first)), second, edges.concave[edge[at]])
+        np.minimum.at(depth, ray, _surface_hit(meet, from_eye[cube], directions[ray], way[ray], near))
     from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye
     for ray, cube in _pairs(from_eye, directions):
         np.minimum.at(depth, ray, _interior_hit(from_eye[cube], directions[ray], way[ray], near))
@@ -107,18 +116,44 @@ def _interior_hit(
     return np.where((enter <= leave) & (enter > near), enter, np.inf)
 
 
-def _surface_hit(
+class Meeting(NamedTuple):
+    """Where rays meet planes, and whether they enter what lies behind them."""
+
+    depth: Float[np.ndarray, "N"]
+    enters: Bool[np.ndarray, "N"]
+
+
+def _meet(
     plane: tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]],
+    from_eye: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "N 3"],
+) -> Meeting:
+    normal, offset = plane
+    facing = (normal * direction).sum(-1)
+    facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
+    return Meeting((offset + (normal * from_eye).sum(-1)) / facing, facing < 0)
+
+
+def _at_edge(first: Meeting, second: Meeting, concave: Bool[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    """Where rays enter the solid at an edge: what lies behind both planes, or behind either (concave). inf where they
+    do not."""
+    enter = [np.where(plane.enters, plane.depth, -np.inf) for plane in (first, second)]
+    leave = [np.where(plane.enters, np.inf, plane.depth) for plane in (first, second)]
+    into, out = np.maximum(*enter), np.minimum(*leave)
+    convex = np.where(into <= out, into, np.inf)
+    either = np.minimum(*(np.where(plane.enters, plane.depth, np.inf) for plane in (first, second)))
+    return np.where(first.enters | second.enters, np.where(concave, either, convex), np.inf)
+
+
+def _surface_hit(
+    meet: Float[np.ndarray, "N"],
     from_eye: Float[np.ndarray, "N 3"],
     direction: Float[np.ndarray, "N 3"],
     way: Float[np.ndarray, "N 2"],
     near: float,
 ) -> Float[np.ndarray, "N"]:
-    normal, offset = plane
     enter, leave = _within(from_eye, direction, way)
-    facing = (normal * direction).sum(-1)
-    facing = np.where(np.abs(facing) < 1e-9, 1e-9, facing)
-    meet = (offset + (normal * from_eye).sum(-1)) / facing
-    reach = np.abs(meet[:, None] * direction - from_eye).max(-1)
-    met = (enter <= leave) & (reach <= 0.5 + INFLATION) & (meet > near)
+    there = np.where(np.isfinite(meet), meet, 0.0)
+    reach = np.abs(there[:, None] * direction - from_eye).max(-1)
+    met = (enter <= leave) & (reach <= 0.5 + INFLATION) & (meet > near) & np.isfinite(meet)
     return np.where(met, meet, np.inf)

@@ -5,10 +5,11 @@
 import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 MOST_CORNERS = 512
+_ROUNDING = 1e-3  # voxels beyond a plane that rays may meet another one, as they are float32
 
 _CUBE = np.array(list(itertools.product((0, 1), repeat=3)))
 
@@ -55,14 +56,41 @@ def patch_corners(
 ) -> Float[np.ndarray, "P 3"]:
     """The corners, in voxels, of what lies of a voxel's plane within `reach` of its middle along every axis. The plane
     is normal . x = offset, from the middle."""
-    corners = []
+    point, crosses = _crossings(normal, offset, reach)
+    return (cells + 0.5 + point)[crosses]
+
+
+def cut_corners(
+    cells: Int[np.ndarray, "S 3"],
+    plane: tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]],
+    other: tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]],
+    reach: float,
+) -> Float[np.ndarray, "P 3"]:
+    """The same of what lies of a plane behind another one."""
+    point, crosses = _crossings(*plane, reach)
+    normal, offset = other
+    beyond = np.einsum("ksi,si->ks", point, normal) - offset - _ROUNDING
+    corners = [(cells + 0.5 + point)[crosses & (beyond <= 0)]]
+    for one, two in itertools.combinations(range(len(point)), 2):  # more than the patch's own sides, none outside of it
+        cut = crosses[one] & crosses[two] & (beyond[one] * beyond[two] < 0)
+        share = (beyond[one, cut] / (beyond[one, cut] - beyond[two, cut]))[:, None]
+        corners.append((cells + 0.5)[cut] + point[one, cut] * (1 - share) + point[two, cut] * share)
+    return np.concatenate(corners)
+
+
+def _crossings(
+    normal: Float[np.ndarray, "S 3"], offset: Float[np.ndarray, "S"], reach: float
+) -> tuple[Float[np.ndarray, "12 S 3"], Bool[np.ndarray, "12 S"]]:
+    """Where planes cross the lines along a cube's edges, from its middle, and whether they do within the cube."""
+    points = []
     for axis in range(3):
         sides = [a for a in range(3) if a != axis]
         for edge in itertools.product((-reach, reach), repeat=2):
-            point = np.empty((len(cells), 3))
+            point = np.empty((len(normal), 3))
             point[:, sides] = edge
             with np.errstate(divide="ignore", invalid="ignore"):
                 point[:, axis] = (offset - normal[:, sides] @ edge) / normal[:, axis]
-            crosses = np.abs(point[:, axis]) <= reach
-            corners.append((cells + 0.5 + point)[crosses])
-    return np.concatenate(corners)
+            points.append(np.where(np.abs(point[:, axis : axis + 1]) <= reach, point, np.nan))
+    crossing = np.stack(points)
+    crosses = np.isfinite(crossing).all(-1)
+    return np.where(crosses[..., None], crossing, 0.0), crosses

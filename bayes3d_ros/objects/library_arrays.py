@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.objects.empty_boxes import empty_boxes
-from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, hull, patch_corners
+from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, cut_corners, hull, patch_corners
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
+from bayes3d_ros.objects.second_planes import edge_planes, planes_met
 from bayes3d_ros.objects.self_symmetry import self_symmetry
-from bayes3d_ros.objects.thin_walls import planes_met
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
@@ -23,6 +23,8 @@ INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the
 BOX_LOOSE = 0.02  # voxels that rays are met beyond the object's box, in which faces lie
 SURFACE_SAMPLES = 96  # of a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
+EDGE = 0x80  # second byte of the word of a voxel that holds an edge: a normal's is never so
+MOST_EDGES = 255 << 15  # voxels of a model that hold an edge and can be told
 SOLID_POINTS = 128  # points inside the solid, for the test of interpenetration
 _TYPE_PAD, _VOXEL_PAD = 4, 1 << 19
 
@@ -33,7 +35,11 @@ class LibraryArrays(NamedTuple):
     A voxel is one 32-bit word: a surface voxel holds its plane, normal (3 x int8, -127 the least) and offset (int8); an
     empty voxel holds -128 and the sides of the empty box ahead (`empty_boxes.py`); one inside the solid is all zeros.
     Every grid is there eight times, once for each octant of directions: of a thin wall in one voxel each octant has the
-    side that its rays meet (`thin_walls.py`).
+    side that its rays meet (`second_planes.py`).
+
+    A voxel that holds an edge has EDGE in its second byte, and in the others a number n: its first byte is (n >> 16) -
+    127, the last two are n & 0xFFFF. Its two planes are words n and n + 1 after the type's grids, n without its lowest
+    bit, which is set where the edge is concave.
     """
 
     num_types: Int[Array, ""]
@@ -82,15 +88,25 @@ def face_size(model: ObjectModel, face: int) -> Float[np.ndarray, "2"]:
     return model.box_size[[(axis + 1) % 3, (axis + 2) % 3]]
 
 
-def pack_voxels(model: ObjectModel) -> Int[np.ndarray, "8 X Y Z"]:
-    """The model's grid as 32-bit words (see LibraryArrays)."""
+def pack_voxels(model: ObjectModel) -> tuple[Int[np.ndarray, "8 X Y Z"], Int[np.ndarray, "E 2"]]:
+    """The model's grid as 32-bit words, and the two planes of every edge (see LibraryArrays)."""
     solid = filled_voxels(model)
     boxes = empty_boxes(solid).astype(np.uint32)
     words = np.where(solid, 0, np.uint32(128) << 24 | boxes[..., 0] << 16 | boxes[..., 1] << 8 | boxes[..., 2])
-    normal, offset = _planes(*planes_met(model), model)
+    planes = _words(*_planes(*planes_met(model), model))
+    edges = edge_planes(model)
+    if len(edges.row) > MOST_EDGES:
+        raise LibraryError(f"{model.name}: {len(edges.row)} voxels hold an edge; {MOST_EDGES} can be told")
+    pairs = np.stack([planes[0, edges.row], _words(*_planes(edges.normal, edges.offset, model))], -1)
+    number = 2 * np.arange(len(edges.row)) | edges.concave
+    planes[:, edges.row] = ((number >> 16) - 127 & 255) << 24 | EDGE << 16 | number & 0xFFFF
+    words[:, *model.surface_index.T] = planes
+    return words.view(np.int32), pairs.astype(np.uint32).view(np.int32)
+
+
+def _words(normal: Int[np.ndarray, "*S 3"], offset: Int[np.ndarray, "*S"]) -> Int[np.ndarray, "*S"]:
     parts = zip((*np.moveaxis(normal, -1, 0), offset), (24, 16, 8, 0), strict=True)
-    words[:, *model.surface_index.T] = sum((part & 255) << shift for part, shift in parts)
-    return words.view(np.int32)
+    return sum((part & 255) << shift for part, shift in parts)
 
 
 def _planes(
@@ -101,17 +117,29 @@ def _planes(
     return np.rint(normal * 127).astype(np.int64), rounded
 
 
+def _in_voxels(
+    normal: Float[np.ndarray, "S 3"], offset: Float[np.ndarray, "S"], model: ObjectModel
+) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
+    """Planes as they are packed, offsets in voxels."""
+    rounded, offsets = _planes(normal, offset, model)
+    return rounded / 127, offsets / 127 * OFFSET_RANGE
+
+
 def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
     """A convex solid around all that rays can meet, in voxels: planes in their inflated cubes, and voxels inside."""
     inside = model.occupancy.copy()
     inside[tuple(model.surface_index.T)] = False
-    planes = [
-        (model.surface_index, *_planes(model.surface_normal, model.surface_offset, model)),
-        (model.back_index, *_planes(model.back_normal, model.back_offset, model)),
-    ]
+    reach = 0.5 + INFLATION
+    front = _in_voxels(model.surface_normal, model.surface_offset, model)
+    back = _in_voxels(model.back_normal, model.back_offset, model)
+    cut = model.back_at_edge & ~model.back_concave
+    edge = model.back_row[cut]
+    whole = np.setdiff1d(np.arange(len(model.surface_index)), edge)
+    planes = (front[0][edge], front[1][edge]), (back[0][cut], back[1][cut])
     patches = [
-        patch_corners(index, normal / 127, offset / 127 * OFFSET_RANGE, 0.5 + INFLATION)
-        for index, normal, offset in planes
+        patch_corners(model.surface_index[whole], front[0][whole], front[1][whole], reach),
+        patch_corners(model.back_index[~cut], back[0][~cut], back[1][~cut], reach),
+        *(cut_corners(model.surface_index[edge], *pair, reach) for pair in (planes, planes[::-1])),
     ]
     return hull(np.concatenate([*patches, cube_corners(np.argwhere(inside))]))
 
@@ -123,7 +151,7 @@ def library_arrays(library: Library) -> LibraryArrays:
     padded = -(-count // _TYPE_PAD) * _TYPE_PAD
     samples = [_spread(m.surface_points, SURFACE_SAMPLES) for m in models]
     hulls = [m.origin + _hull(m) * m.voxel_size for m in models]
-    grids = [pack_voxels(m).ravel() for m in models]
+    grids = [np.concatenate([part.ravel() for part in pack_voxels(m)]) for m in models]
     T_contact_object = [np.stack([contact_transform(m, f) for f in range(NUM_FACES)]) for m in models]
     alike = [
         self_symmetry(m.surface_points, m.surface_normal, T) for m, T in zip(models, T_contact_object, strict=True)

@@ -15,6 +15,7 @@ from bayes3d_ros.lists import first_few
 _SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
 _NAMES_TOLD = 6  # of a library, in a line about a name that it does not hold
+OPPOSITE = -0.3  # cosine between the two planes of a voxel, up to which they are both sides of a wall
 UNKNOWN = "unknown"  # the type of things of no type in the library: no model may have this name, in any case
 
 
@@ -29,8 +30,10 @@ class ObjectModel:
     Voxel (i, j, k) is the cube [origin + voxel_size * (i, j, k), + voxel_size]. `occupancy` is the solid with its
     cavities open (the inside of a mug is not occupied). Every surface voxel carries a plane fitted to the piece of
     surface inside it, normal . (x - centre_of_voxel) = offset, so that a coarse grid still renders a smooth and
-    accurate surface; normals point out of the solid where that is known. A voxel of `back_index` holds both sides of a
-    thin wall: `back_normal` and `back_offset` are the plane of the side with less area (`thin_walls.py`).
+    accurate surface; normals point out of the solid where that is known. A voxel of `back_index` holds two pieces of
+    surface, and `back_normal` and `back_offset` are the plane of the one with less area: the other side of a thin wall,
+    or of an edge, at which the solid is what lies behind both planes or (`back_concave`) behind either
+    (`second_planes.py`).
 
     `box` is a stored box around the object; its face k = 0..5 is its +x -x +y -y +z -z side. An object that touches the
     table with face k rests with `contact_normal[k]` pointing straight down: the resting facet of the convex hull
@@ -55,6 +58,7 @@ class ObjectModel:
     back_index: Int[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3), int))  # some of surface_index
     back_normal: Float[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     back_offset: Float[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0))  # metres
+    back_concave: Bool[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         _check(self)
@@ -63,7 +67,32 @@ class ObjectModel:
     def surface_points(self) -> Float[np.ndarray, "S 3"]:
         """One point on the surface for every surface voxel, in the object frame."""
         centres = self.origin + (self.surface_index + 0.5) * self.voxel_size
-        return centres + self.surface_normal * self.surface_offset[:, None]
+        return centres + self.surface_normal * self.surface_offset[:, None] + self._back_to_edges()
+
+    @property
+    def back_row(self) -> Int[np.ndarray, "B"]:
+        """Which of the surface voxels those of `back_index` are."""
+        row_of = np.full(self.occupancy.shape, -1)
+        row_of[tuple(self.surface_index.T)] = np.arange(len(self.surface_index))
+        return row_of[tuple(self.back_index.T)]
+
+    @property
+    def back_at_edge(self) -> Bool[np.ndarray, "B"]:
+        """Whether the two planes of a voxel of `back_index` meet at an edge; else they are both sides of a wall."""
+        return np.einsum("ij,ij->i", self.surface_normal[self.back_row], self.back_normal) > OPPOSITE
+
+    def _back_to_edges(self) -> Float[np.ndarray, "S 3"]:
+        """From the point of each voxel's plane that is nearest to its middle to where the surface ends, if the point
+        lies beyond an edge. Metres."""
+        moved = np.zeros((len(self.surface_index), 3))
+        edge = self.back_at_edge
+        row, other = self.back_row[edge], self.back_normal[edge]
+        normal = self.surface_normal[row]
+        alike = np.einsum("ij,ij->i", normal, other)
+        beyond = alike * self.surface_offset[row] - self.back_offset[edge]  # along the other plane's normal
+        beyond = np.where(self.back_concave[edge], np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
+        moved[row] = -(beyond / np.maximum(1 - alike**2, 0.1))[:, None] * (other - alike[:, None] * normal)
+        return moved
 
 
 def is_reserved(name: str) -> bool:
@@ -99,6 +128,7 @@ def _check(model: ObjectModel) -> None:
         "back_index": (backs, 3),
         "back_normal": (backs, 3),
         "back_offset": (backs,),
+        "back_concave": (backs,),
     }
     for name, shape in shapes.items():
         value = getattr(model, name)

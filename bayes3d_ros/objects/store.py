@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayes3d_ros.files.atomic import write_whole
-from bayes3d_ros.files.npz_file import read_arrays
+from bayes3d_ros.files.npz_file import read_arrays, write_arrays
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
 
@@ -80,11 +80,13 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
         arrays["back"] = np.packbits(np.isin(np.flatnonzero(surface), back, assume_unique=True))
         arrays["back_normal"] = _normal_bytes(model.back_normal[own])
         arrays["back_offset"] = _offset_bytes(model.back_offset[own], model.voxel_size)
+        if model.back_concave.any():
+            arrays["back_concave"] = np.packbits(model.back_concave[own])
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
     path = model_path(folder, model.name)
     try:
-        write_whole(path, lambda file: np.savez_compressed(file, **arrays), mode=0o644, replace=replace)
+        write_whole(path, lambda file: write_arrays(file, arrays), mode=0o644, replace=replace)
     except FileExistsError:
         refuse_existing(folder, model.name)
         raise
@@ -145,6 +147,7 @@ _TYPES: dict[str, Any] = {
     "back": np.uint8,
     "back_normal": np.int8,
     "back_offset": np.int8,
+    "back_concave": np.uint8,
 }
 
 
@@ -176,6 +179,12 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
         backs["back_index"] = index[np.unpackbits(arrays["back"], count=len(index)).astype(bool)]
         planes = _planes(arrays, "back", len(backs["back_index"]), voxel_size)
         backs["back_normal"], backs["back_offset"] = planes
+        count = len(backs["back_index"])
+        backs["back_concave"] = np.zeros(count, bool)  # files of versions before have none
+        if "back_concave" in arrays:
+            if arrays["back_concave"].shape != ((count + 7) // 8,):
+                raise ValueError(f"back_concave must hold {(count + 7) // 8} bytes for {count} second planes")
+            backs["back_concave"] = np.unpackbits(arrays["back_concave"], count=count).astype(bool)
     if frames.shape != (24,):
         raise ValueError(f"frames must hold 24 numbers, got {frames.shape}")
     return ObjectModel(

@@ -76,12 +76,12 @@ def test_a_model_is_drawn_in_millimetres_about_its_own_middle(box):
 
 
 def test_voxels_that_no_view_saw_are_red(box):
-    views = np.where(box.surface_points[:, 0] > 0, 2, 0)
+    views = np.where(box.surface_points[:, 0] > 0.001, 2, 0)
     axis = Figure().add_subplot()
     draw_model(axis, replace(box, surface_views=views), None, model_reach(box), panel=100)
     (dots,) = axis.collections
     red = dots.get_facecolors()[:, 0] > dots.get_facecolors()[:, 2]
-    np.testing.assert_array_equal(red, np.asarray(dots.get_offsets())[:, 0] <= 0)
+    np.testing.assert_array_equal(red, np.asarray(dots.get_offsets())[:, 0] <= 1.0)
 
 
 @pytest.mark.parametrize("count", [1, 7])

@@ -18,7 +18,7 @@ def solid(library: Library, occupancy: np.ndarray) -> ObjectModel:
     return replace(
         model, occupancy=occupancy, surface_index=inside, surface_normal=np.array([[0.0, 0, 1]]), surface_views=None,
         surface_offset=np.zeros(1), back_index=np.zeros((0, 3), int), back_normal=np.zeros((0, 3)),
-        back_offset=np.zeros(0),
+        back_offset=np.zeros(0), back_concave=np.zeros(0, bool),
     )  # fmt: skip
 
 

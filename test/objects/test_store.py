@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from bayes3d_ros.objects import store
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import LibraryError
 from bayes3d_ros.objects.store import learned_from, load_library, load_model, refuse_existing, save_model
@@ -40,7 +41,8 @@ def test_round_trip(model, tmp_path):
     read = load_model(path)
     for name in ("name", "voxel_size", "provenance"):
         assert getattr(read, name) == getattr(model, name)
-    for name in ("occupancy", "surface_index", "back_index"):
+    assert model.back_concave.any() and not model.back_concave.all()
+    for name in ("occupancy", "surface_index", "back_index", "back_concave"):
         np.testing.assert_array_equal(getattr(read, name), getattr(model, name))
     for name in ("origin", "T_object_box", "box_size", "contact_normal", "contact_height"):
         np.testing.assert_allclose(getattr(read, name), getattr(model, name), atol=1e-12)
@@ -55,7 +57,7 @@ def test_round_trip(model, tmp_path):
 
 def test_files_without_planes_of_second_sides_are_read(model, tmp_path):
     path = save_model(model, tmp_path)
-    rewrite(path, back=None, back_normal=None, back_offset=None)
+    rewrite(path, back=None, back_normal=None, back_offset=None, back_concave=None)
     read = load_model(path)
     assert len(read.back_index) == 0 and len(read.surface_index) == len(model.surface_index)
 
@@ -73,7 +75,7 @@ def test_the_order_of_surface_voxels_does_not_matter(model, tmp_path):
     shuffled = dataclasses.replace(
         model,
         **{name: getattr(model, name)[order] for name in fields},
-        **{name: getattr(model, name)[backs] for name in ("back_index", "back_normal", "back_offset")},
+        **{f"back_{name}": getattr(model, f"back_{name}")[backs] for name in ("index", "normal", "offset", "concave")},
     )
     assert save_model(model, tmp_path / "a").read_bytes() == save_model(shuffled, tmp_path / "b").read_bytes()
 
@@ -92,7 +94,7 @@ def test_a_failed_write_leaves_the_old_model_and_no_rubbish(model, tmp_path, mon
     def full(*_args, **_kwargs):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr(store, "write_arrays", full)
     with pytest.raises(OSError):
         save_model(model, tmp_path, replace=True)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
@@ -111,13 +113,13 @@ def test_an_older_model_is_replaced_only_where_told(model, tmp_path):
 
 @pytest.mark.parametrize("hard_links", [True, False])
 def test_a_model_written_meanwhile_is_not_lost(model, tmp_path, monkeypatch, hard_links):
-    path, compress = tmp_path / "my_mug-1.npz", np.savez_compressed
+    path, write = tmp_path / "my_mug-1.npz", store.write_arrays
 
-    def overtaken(file, **arrays):
-        compress(file, **arrays)
+    def overtaken(file, arrays):
+        write(file, arrays)
         path.write_text("of another process")
 
-    monkeypatch.setattr(np, "savez_compressed", overtaken)
+    monkeypatch.setattr(store, "write_arrays", overtaken)
     if not hard_links:
         monkeypatch.setattr("os.link", lambda *_: (_ for _ in ()).throw(PermissionError("no hard links here")))
     with pytest.raises(LibraryError, match="exists already"):
@@ -279,7 +281,15 @@ def test_wrong_meta_is_named(model, tmp_path, changes, reason):
         ({"T_object_box": np.diag([1.0, 1, -1, 1])}, "rigid"),
         ({"origin": np.zeros(4)}, "origin must have shape"),
         ({"back_index": np.full((1, 3), -1)}, "back_normal must have shape"),
-        ({"back_index": np.full((1, 3), 99), "back_normal": np.eye(3)[:1], "back_offset": np.zeros(1)}, "back_index"),
+        (
+            {
+                "back_index": np.full((1, 3), 99),
+                "back_normal": np.eye(3)[:1],
+                "back_offset": np.zeros(1),
+                "back_concave": np.zeros(1, bool),
+            },
+            "back_index",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

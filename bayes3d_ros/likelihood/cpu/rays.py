@@ -24,9 +24,9 @@ from bayes3d_ros.likelihood.cpu.buffers import (
 from bayes3d_ros.likelihood.cpu.compiling import fast, inlined
 from bayes3d_ros.likelihood.cpu.outlines import cut_rows
 from bayes3d_ros.likelihood.cpu.packing import MEMBERS, ORDERS, less, negative, pack
-from bayes3d_ros.likelihood.march import MOST_STEPS, NEAREST_HIT, NUDGE
+from bayes3d_ros.likelihood.march import MOST_STEPS, NEAREST_HIT, NUDGE, PASSED
 from bayes3d_ros.likelihood.tiles import ROUNDING
-from bayes3d_ros.objects.library_arrays import EMPTY, INFLATION, OFFSET_RANGE
+from bayes3d_ros.objects.library_arrays import EDGE, EMPTY, INFLATION, OFFSET_RANGE
 
 # Tuning of speed; what it was chosen on is in docs/speed.md.
 _ROOM_RAYS = 64  # places to be free before more are sent: a quarter of `RAYS_SIDE_BY_SIDE`
@@ -109,11 +109,43 @@ def _find(grid, lanes, count):
         word[k] = grid.first + octant * grid.voxels + i32((a * grid.ny + b) * grid.nz + c)  # below 2^24: exact
 
 
+@fast
+def _meet(word, a, b, c, ra, rb, rc):
+    """Where a ray meets a word's plane, and whether it enters what lies behind it."""
+    na, nb, nc = f32(word >> i32(24)), f32(i32(word << i32(8)) >> i32(24)), f32(i32(word << i32(16)) >> i32(24))
+    offset = f32(i32(word << i32(24)) >> i32(24)) * f32(OFFSET_RANGE)
+    facing = na * a + nb * b + nc * c
+    facing = f32(1e-6) if abs(facing) < f32(1e-6) else facing
+    return (offset - (na * ra + nb * rb + nc * rc)) / facing, facing < f32(0.0)
+
+
+@fast
+def _at_edge(words, edges, word, a, b, c, ra, rb, rc):
+    """As `march.at_edge`, of the word of a voxel that holds an edge."""
+    number = i32(i32(i32(word >> i32(24)) + i32(127)) << i32(16)) | (word & i32(0xFFFF))
+    place = u64(edges + (number & i32(~1)))
+    one, other = words[place], words[place + u64(1)]
+    meet_one, enters_one = _meet(one, a, b, c, ra, rb, rc)
+    meet_other, enters_other = _meet(other, a, b, c, ra, rb, rc)
+    concave = (number & i32(1)) == i32(1)
+    if enters_one and enters_other:
+        return other if (meet_other < meet_one) == concave else one
+    if enters_other:
+        return other if concave or meet_other <= meet_one else i32(PASSED)
+    return one if enters_one and (concave or meet_one <= meet_other) else i32(PASSED)
+
+
 @inlined
-def _look_up(words, lanes, count):
-    word = lanes.word
+def _look_up(words, grid, lanes, count):
+    """The words of the voxels that rays are in. Of the two planes of an edge that in which a ray enters the solid."""
+    word, dx, dy, dz = lanes.word, lanes.x, lanes.y, lanes.z
+    eye_x, eye_y, eye_z = lanes.eye_x, lanes.eye_y, lanes.eye_z
+    edges = grid.first + i32(8) * grid.voxels
     for k in range(u64(count)):
-        word[k] = words[u64(word[k])]
+        w = words[u64(word[k])]
+        if (w & i32(0xFF0000)) == i32(EDGE << 16) and w >= i32(EMPTY):
+            w = _at_edge(words, edges, w, dx[k], dy[k], dz[k], eye_x[k], eye_y[k], eye_z[k])
+        word[k] = w
 
 
 @inlined
@@ -189,7 +221,7 @@ def _walk(words, grid, lanes, count, most, met, patch):
         for _ in range(_STEPS_BEFORE_ROOM):
             full = whole_vectors(count)
             _find(grid, lanes, full)
-            _look_up(words, lanes, full)
+            _look_up(words, grid, lanes, full)
             _advance(lanes, full)
         left -= _STEPS_BEFORE_ROOM
         count = _make_room(lanes, count, met, patch)

@@ -6,9 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
+from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays, pack_voxels
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import save_model
 
@@ -26,11 +24,11 @@ def model_sizes(library: Library) -> ModelSizes:
     with tempfile.TemporaryDirectory(prefix="bayes3d-model-sizes-") as folder:
         files = tuple(save_model(model, Path(folder)).stat().st_size for model in library.models)
     arrays = library_arrays(library)
-    return ModelSizes(files, _own_bytes(arrays), sum(array.nbytes for array in arrays))
+    words = sum(part.size for model in library.models for part in pack_voxels(model))
+    return ModelSizes(files, _own_bytes(arrays, words), sum(array.nbytes for array in arrays))
 
 
-def _own_bytes(arrays: LibraryArrays) -> int:
+def _own_bytes(arrays: LibraryArrays, words: int) -> int:
     own, padded = int(arrays.num_types), len(arrays.first)
-    voxels = 8 * int(np.prod(np.asarray(arrays.dims[:own], np.int64), axis=1).sum())  # a grid for each octant
     types = [array for name, array in arrays._asdict().items() if name != "words" and array.ndim]
-    return voxels * arrays.words.dtype.itemsize + sum(array.nbytes * own // padded for array in types)
+    return words * arrays.words.dtype.itemsize + sum(array.nbytes * own // padded for array in types)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Voxels in which two sides of an edge meet."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bayes3d_ros.geometry.mesh import SurfaceSamples
+from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of
+
+_LEAST_SIDE = 0.1  # of a voxel's face: the area of either side of an edge, in and closely around the voxel
+_AROUND = 0.2  # voxels: where planes go on beyond their cubes, an edge has to be known (`library_arrays.INFLATION`)
+_SAME_SIDE = 0.7  # cosine between a side of an edge and the normals of its samples, at least
+_SEED = 0.8  # likewise of the samples that it is sought with
+_CLEAR = 0.02  # voxels by which each side's middle lies behind the other's plane, or before it
+_DIRECTIONS, _ALIKE = 64, 0.9  # in which normals are counted, and the cosine of those that are counted together
+
+
+class EdgeVoxels(NamedTuple):
+    """Voxels in which two sides of an edge meet, the larger side first."""
+
+    row: Int[np.ndarray, "E"]  # among the surface voxels
+    normal: Float[np.ndarray, "E 2 3"]
+    offset: Float[np.ndarray, "E 2"]  # metres from the voxel's centre
+    concave: Bool[np.ndarray, "E"]
+
+
+def find_edges(
+    samples: SurfaceSamples,
+    front: Patches,
+    back: Patches,
+    origin: Float[np.ndarray, "3"],
+    voxel_size: float,
+    shape: tuple[int, ...],
+) -> EdgeVoxels:
+    """Where the surface in and closely around a voxel has two sides. Voxels that hold both sides of a thin wall are
+    left as they are, and so are those whose normals do not agree on which side the solid is."""
+    row, sample, local = _around(samples, front, origin, voxel_size, shape)
+    count, normals = len(front.voxel), samples.normals[sample]
+    left = np.ones(len(row), bool)
+    sides = []
+    for _ in range(3):
+        side, own = _largest_side(row, normals, local, left, count)
+        sides.append(side)
+        left &= ~own
+    number, normal, offset, middle = (np.stack(part, 1) for part in zip(*sides, strict=True))
+    order = np.argsort(-number, 1, kind="stable")[:, :2]
+    two = np.arange(count)[:, None], order
+    number, normal, offset, middle = (part[two] for part in (number, normal, offset, middle))
+    area = number * samples.area / voxel_size**2
+    beyond = np.einsum("sij,sij->si", normal, middle[:, ::-1]) - offset  # of each side's middle, from the other's plane
+    convex, concave = (beyond < -_CLEAR).all(1), (beyond > _CLEAR).all(1)
+    meet = np.einsum("si,si->s", normal[:, 0], normal[:, 1]) > SAME_SHEET
+    walls = np.zeros(shape, bool)
+    walls[tuple(back.voxel.T)] = True
+    found = (area > _LEAST_SIDE).all(1) & (convex | concave) & meet & ~walls[tuple(front.voxel.T)]
+    limit = np.sqrt(3) / 2
+    found &= (np.abs(offset) <= limit).all(1)
+    return EdgeVoxels(np.flatnonzero(found), normal[found], offset[found] * voxel_size, concave[found])
+
+
+def _around(
+    samples: SurfaceSamples,
+    front: Patches,
+    origin: Float[np.ndarray, "3"],
+    voxel_size: float,
+    shape: tuple[int, ...],
+) -> tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
+    """Surface voxels and the samples in and closely around each, with their places in voxels from its centre."""
+    row_of = np.full(np.array(shape) + 2, -1)
+    row_of[tuple(front.voxel.T + 1)] = np.arange(len(front.voxel))
+    position = (samples.points - origin) / voxel_size
+    cell = cells_of(position, shape)
+    side = np.where(position - cell < 0.5, -1, 1)
+    rows, which, places = [], [], []
+    for step in itertools.product((0, 1), repeat=3):
+        near = cell + side * step
+        local = position - near - 0.5
+        row = row_of[tuple((near + 1).T)]
+        sample = np.flatnonzero((row >= 0) & (np.abs(local) <= 0.5 + _AROUND).all(1))
+        rows.append(row[sample])
+        which.append(sample)
+        places.append(local[sample])
+    return np.concatenate(rows), np.concatenate(which), np.concatenate(places)
+
+
+class _Side(NamedTuple):
+    """Of every voxel a flat piece of its surface; places in voxels from its centre."""
+
+    number: Float[np.ndarray, "S"]  # of samples
+    normal: Float[np.ndarray, "S 3"]
+    offset: Float[np.ndarray, "S"]
+    middle: Float[np.ndarray, "S 3"]
+
+
+def _largest_side(
+    row: Int[np.ndarray, "M"],
+    normals: Float[np.ndarray, "M 3"],
+    local: Float[np.ndarray, "M 3"],
+    left: Bool[np.ndarray, "M"],
+    count: int,
+) -> tuple[_Side, Bool[np.ndarray, "M"]]:
+    """The side that most of the samples that are left agree on, and which samples are of it."""
+    k = np.arange(_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + 5**0.5) * k
+    directions = np.stack([np.sqrt(1 - height**2) * f(turn) for f in (np.cos, np.sin)] + [height], 1)
+    nearest = (normals @ directions.T).argmax(1)
+    votes = np.bincount(row[left] * _DIRECTIONS + nearest[left], minlength=count * _DIRECTIONS)
+    together = (directions @ directions.T > _ALIKE).astype(float)
+    normal = directions[(votes.reshape(count, _DIRECTIONS) @ together).argmax(1)]
+
+    def mean(values: np.ndarray, own: np.ndarray) -> np.ndarray:
+        total = np.stack([np.bincount(row[own], values[own, i], count) for i in range(3)], 1)
+        return total / np.maximum(np.bincount(row[own], minlength=count), 1)[:, None]
+
+    for cosine in (_SEED, _SAME_SIDE):
+        own = left & (np.einsum("ij,ij->i", normals, normal[row]) > cosine)
+        towards = mean(normals, own)
+        length = np.linalg.norm(towards, axis=1, keepdims=True)
+        normal = np.where(length > 0.1, towards / np.maximum(length, 1e-9), normal)
+    own = left & (np.einsum("ij,ij->i", normals, normal[row]) > _SAME_SIDE)
+    middle = mean(local, own)
+    offset = np.einsum("ij,ij->i", normal, middle)
+    return _Side(np.bincount(row[own], minlength=count).astype(float), normal, offset, middle), own
