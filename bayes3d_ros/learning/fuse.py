@@ -131,10 +131,19 @@ def _passed(
     depth = np.where(frame.depth > 0, frame.depth, 0.0)  # NaN: no return says nothing
     # The whole of a voxel, from any side.
     width = np.sqrt(3) * voxel_size * frame.intrinsics.fx / max(float(np.median(z)), 1e-3)
-    nearest = ndimage.minimum_filter(depth, 2 * int(np.ceil(width / 2)) + 1)
-    around, middle = np.zeros(len(z)), np.zeros(len(z))
-    around[inside], middle[inside] = nearest[v[inside], u[inside]], depth[v[inside], u[inside]]
-    all_through = around > z + np.where(low, -BEHIND_VOXEL, np.sqrt(3) / 2 * voxel_size + BEHIND_VOXEL)
+    side = 2 * int(np.ceil(width / 2)) + 1
+
+    def seen_there(image: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "V"]:
+        return np.where(inside, image[v * inside, u * inside], -np.inf)
+
+    # Each pixel is compared with the table that it would see: a wall that rises beside the voxel is nearer than that.
+    heights = frame.intrinsics.rays() @ T_table_camera[2, :3]  # a metre of depth on
+    past_table = np.where(
+        (depth > 0) & (heights < 0), depth - T_table_camera[2, 3] / np.maximum(-heights, 1e-9), -np.inf
+    )
+    around, middle = seen_there(ndimage.minimum_filter(depth, side)), seen_there(depth)
+    table = seen_there(ndimage.minimum_filter(past_table, side)) > -BEHIND_VOXEL
+    all_through = np.where(low, table, around > z + np.sqrt(3) / 2 * voxel_size + BEHIND_VOXEL)
     through = middle > z + np.where(low, -BEHIND_VOXEL, voxel_size / 2 + BEHIND_VOXEL / 2)
     return all_through.astype(int), through.astype(int)
 

@@ -90,6 +90,19 @@ def test_the_notch_is_free_and_the_inside_is_solid(learned):
     assert not solid(0.03, 0.0, 0.08)
 
 
+def test_the_foot_of_what_stands_upright_is_whole():
+    """Beside a wall that faces the camera the table is in sight, and the wall is hardly nearer than that."""
+    radius = 0.046
+    can = trimesh.creation.cylinder(radius, 0.08, sections=90).apply_translation((0, 0, 0.04))
+    captures = capture(resting_object("can", can), np.eye(4), 5, (0.0, 0.0), seed=5)
+    found = learn(captures.frames, "can", LearnerSettings(voxel_size=0.003))
+    points = found.model.surface_points + found.T_table_object[:3, 3]
+    seen = found.model.surface_views > 0
+    wall = seen & (points[:, 2] > 0.005) & (points[:, 2] < 0.01) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.003)
+    turn = np.degrees(np.arctan2(points[wall, 1], points[wall, 0])) % 360
+    assert len(np.unique(turn // 6)) >= 58, len(np.unique(turn // 6))  # of 60
+
+
 def test_what_no_view_saw_is_known(bracket):
     captures = capture(*bracket, 1, (0.0, 0.0), seed=3)
     found = learn(captures.frames, "bracket", SETTINGS)
