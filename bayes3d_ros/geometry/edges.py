@@ -6,17 +6,20 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
+from bayes3d_ros.geometry.directions import spread_directions
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of
 
+WALL, CONVEX, CONCAVE = range(3)  # what the two planes of a voxel are: both sides of a wall, or an edge's
 _LEAST_SIDE = 0.1  # of a voxel's face: the area of either side of an edge, in and closely around the voxel
-_AROUND = 0.2  # voxels: where planes go on beyond their cubes, an edge has to be known (`library_arrays.INFLATION`)
+AROUND = 0.2  # voxels that planes go on beyond their cubes: an edge that is no farther away has to be known
 _SAME_SIDE = 0.7  # cosine between a side of an edge and the normals of its samples, at least
 _SEED = 0.8  # likewise of the samples that it is sought with
-_CLEAR = 0.02  # voxels by which each side's middle lies behind the other's plane, or before it
+_CLEAR = 0.02  # voxels by which each side's middle lies behind the other's plane, or before it, where they meet
 _DIRECTIONS, _ALIKE = 64, 0.9  # in which normals are counted, and the cosine of those that are counted together
+_AT_A_TIME = 2**16  # normals, which bounds memory
 
 
 class EdgeVoxels(NamedTuple):
@@ -36,14 +39,15 @@ def find_edges(
     voxel_size: float,
     shape: tuple[int, ...],
 ) -> EdgeVoxels:
-    """Where the surface in and closely around a voxel has two sides. Voxels that hold both sides of a thin wall are
-    left as they are, and so are those whose normals do not agree on which side the solid is."""
+    """Where the surface in and closely around a voxel has two sides, of the largest two if there are more. Voxels that
+    hold both sides of a thin wall are left as they are. So are edges sharper than 73 degrees (whose normals have a
+    cosine below SAME_SHEET): their sides cannot be told from those of a wall."""
     row, sample, local = _around(samples, front, origin, voxel_size, shape)
-    count, normals = len(front.voxel), samples.normals[sample]
+    count, normals, nearest = len(front.voxel), samples.normals[sample], _nearest_direction(samples.normals)[sample]
     left = np.ones(len(row), bool)
     sides = []
     for _ in range(3):
-        side, own = _largest_side(row, normals, local, left, count)
+        side, own = _largest_side(row, (normals, nearest), local, left, count)
         sides.append(side)
         left &= ~own
     number, normal, offset, middle = (np.stack(part, 1) for part in zip(*sides, strict=True))
@@ -80,7 +84,7 @@ def _around(
         near = cell + side * step
         local = position - near - 0.5
         row = row_of[tuple((near + 1).T)]
-        sample = np.flatnonzero((row >= 0) & (np.abs(local) <= 0.5 + _AROUND).all(1))
+        sample = np.flatnonzero((row >= 0) & (np.abs(local) <= 0.5 + AROUND).all(1))
         rows.append(row[sample])
         which.append(sample)
         places.append(local[sample])
@@ -96,19 +100,27 @@ class _Side(NamedTuple):
     middle: Float[np.ndarray, "S 3"]
 
 
+def _nearest_direction(normals: Float[np.ndarray, "N 3"]) -> Integer[np.ndarray, "N"]:
+    """Of the directions that sides are counted in."""
+    directions, found = spread_directions(_DIRECTIONS), np.empty(len(normals), np.uint8)
+    for start in range(0, len(normals), _AT_A_TIME):
+        part = slice(start, start + _AT_A_TIME)
+        found[part] = (normals[part] @ directions.T).argmax(1)
+    return found
+
+
 def _largest_side(
     row: Int[np.ndarray, "M"],
-    normals: Float[np.ndarray, "M 3"],
+    directed: tuple[Float[np.ndarray, "M 3"], Integer[np.ndarray, "M"]],
     local: Float[np.ndarray, "M 3"],
     left: Bool[np.ndarray, "M"],
     count: int,
 ) -> tuple[_Side, Bool[np.ndarray, "M"]]:
-    """The side that most of the samples that are left agree on, and which samples are of it."""
-    k = np.arange(_DIRECTIONS) + 0.5
-    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + 5**0.5) * k
-    directions = np.stack([np.sqrt(1 - height**2) * f(turn) for f in (np.cos, np.sin)] + [height], 1)
-    nearest = (normals @ directions.T).argmax(1)
+    """The side that most of the samples that are left agree on, and which samples are of it. directed: normals, and the
+    direction next to each."""
+    normals, nearest = directed
     votes = np.bincount(row[left] * _DIRECTIONS + nearest[left], minlength=count * _DIRECTIONS)
+    directions = spread_directions(_DIRECTIONS)
     together = (directions @ directions.T > _ALIKE).astype(float)
     normal = directions[(votes.reshape(count, _DIRECTIONS) @ together).argmax(1)]
 

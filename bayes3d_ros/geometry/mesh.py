@@ -100,6 +100,19 @@ def _metres(extents: Float[np.ndarray, "3"]) -> str:
     return " x ".join(f"{e:.3g}" for e in extents) + " m"
 
 
+def wound_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The same surface, the faces of each connected piece wound alike, and so that normals point out of the solid: of
+    closed pieces each, of open ones together (by the volume between them and the middle of the mesh)."""
+    outward = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    trimesh.repair.fix_winding(outward)
+    trimesh.repair.fix_inversion(outward, multibody=True)
+    from_middle = outward.triangles - outward.bounds.mean(0)
+    if np.linalg.det(from_middle).sum() < 0:
+        outward.invert()
+        trimesh.repair.fix_inversion(outward, multibody=True)
+    return outward
+
+
 def sample_surface(mesh: trimesh.Trimesh, spacing: float, seed: int = 0) -> SurfaceSamples:
     """Points about `spacing` metres apart, uniform by area; the same seed gives the same points.
 

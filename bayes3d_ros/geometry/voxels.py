@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from scipy import ndimage
 
-from bayes3d_ros.geometry.edges import EdgeVoxels, find_edges
-from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem
+from bayes3d_ros.geometry.edges import CONCAVE, CONVEX, WALL, find_edges
+from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem, wound_outward
 from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of, fit_planes
 
 MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
@@ -29,10 +29,10 @@ class VoxelSolid(NamedTuple):
     surface_index: Int[np.ndarray, "S 3"]
     surface_normal: Float[np.ndarray, "S 3"]
     surface_offset: Float[np.ndarray, "S"]
-    back_index: Int[np.ndarray, "B 3"] = np.zeros((0, 3), int)
-    back_normal: Float[np.ndarray, "B 3"] = np.zeros((0, 3))
-    back_offset: Float[np.ndarray, "B"] = np.zeros(0)
-    back_concave: Bool[np.ndarray, "B"] = np.zeros(0, bool)
+    second_index: Int[np.ndarray, "B 3"] = np.zeros((0, 3), int)
+    second_normal: Float[np.ndarray, "B 3"] = np.zeros((0, 3))
+    second_offset: Float[np.ndarray, "B"] = np.zeros(0)
+    second_kind: Integer[np.ndarray, "B"] = np.zeros(0, np.uint8)
 
     @property
     def centre_of_mass(self) -> Float[np.ndarray, "3"]:
@@ -56,9 +56,8 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
         raise MeshError(f"at a voxel size of {voxel_size} m the grid would be {size} voxels; {remedy}")
     shape = shape.astype(int)
     origin = (low + high) / 2 - shape * voxel_size / 2
+    mesh = wound_outward(mesh)
     samples = sample_surface(mesh, voxel_size / _SAMPLES_PER_EDGE)
-    if mesh.volume < 0:  # wound inside out
-        samples = samples._replace(normals=-samples.normals)
     patches = fit_planes(samples, origin, voxel_size, tuple(shape.tolist()))
     touched = np.zeros(shape, bool)
     touched[tuple(patches.voxel.T)] = True
@@ -82,7 +81,7 @@ class SecondPlanes(NamedTuple):
     voxel: Int[np.ndarray, "B 3"]
     normal: Float[np.ndarray, "B 3"]
     offset: Float[np.ndarray, "B"]
-    concave: Bool[np.ndarray, "B"]
+    kind: Integer[np.ndarray, "B"]
 
 
 def two_planes(
@@ -96,15 +95,15 @@ def two_planes(
     """The planes of voxels with a single piece of surface, and of the larger piece where there are two; and those of
     the smaller pieces. oriented: whether normals agree on which side the solid is; else nothing meets at an edge."""
     back = _back_sheets(samples, kept, origin, voxel_size, shape)
-    edges = find_edges(samples, kept, back, origin, voxel_size, shape)
-    edges = edges if oriented else EdgeVoxels(*(part[:0] for part in edges))
+    unoriented = SurfaceSamples(samples.points[:0], samples.normals[:0], samples.area)
+    edges = find_edges(samples if oriented else unoriented, kept, back, origin, voxel_size, shape)
     normal, offset = kept.normal.copy(), kept.offset.copy()
     normal[edges.row], offset[edges.row] = edges.normal[:, 0], edges.offset[:, 0]
     second = SecondPlanes(
         np.concatenate([back.voxel, kept.voxel[edges.row]]),
         np.concatenate([back.normal, edges.normal[:, 1]]),
         np.concatenate([back.offset, edges.offset[:, 1]]),
-        np.concatenate([np.zeros(len(back.voxel), bool), edges.concave]),
+        np.concatenate([np.full(len(back.voxel), WALL), np.where(edges.concave, CONCAVE, CONVEX)]).astype(np.uint8),
     )
     order = np.lexsort(second.voxel.T[::-1])
     return kept._replace(normal=normal, offset=offset), SecondPlanes(*(part[order] for part in second))

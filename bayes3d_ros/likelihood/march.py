@@ -7,7 +7,7 @@ meets its plane within that cube inflated by INFLATION; a voxel inside the solid
 voxel holds an edge, the solid is what lies behind both of its planes, or behind either (`at_edge`).
 Planes make depth a smooth function of pose, at a voxel size far coarser than the error; the inflation closes the cracks
 between planes that differ. Rays are followed within the object's box only, where planes would go on past its edges.
-Everything is arithmetic on whole arrays and one 32-bit gather a step, on CPU and GPU alike.
+Everything is arithmetic on whole arrays and three 32-bit gathers a step, on CPU and GPU alike.
 Most rays end within a few steps, and a few go on for dozens: after the first steps the remaining rays are packed
 together.
 """
@@ -220,16 +220,18 @@ def _meet(word: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> tupl
 
 
 def at_edge(look_up: Callable, word: Array, edges: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> Array:
-    """Of voxels that hold an edge the word of the plane in which rays enter the solid: what lies behind both planes, or
-    behind either where the edge is concave; that of an empty voxel where they do not. Other words as they are."""
+    """Of voxels that hold an edge the word of the plane in which rays enter the solid (what lies behind both planes, or
+    behind either where the edge is concave), or in which they leave it where they enter neither plane: a sheet is met
+    from behind too, as everywhere. That of an empty voxel where they pass. Other words as they are."""
     edge = ((word >> 16) & 255 == EDGE) & (word >= EMPTY)
     number = jnp.where(edge, ((word >> 24) + 127) << 16 | word & 0xFFFF, 0)
-    one, _ = look_up(edges + (number & ~1), [])
-    other, _ = look_up(edges + (number & ~1) + 1, [])
+    first = jnp.where(edge, edges + (number & ~1), 0)
+    (one, _), (other, _) = look_up(first, []), look_up(first + 1, [])
     (meet_one, enters_one), (meet_other, enters_other) = (_meet(plane, from_centre, d) for plane in (one, other))
     concave = number & 1 == 1
-    # Convex: entered at the later of two, or in the one that is met before the other is left.
-    takes_other = jnp.where(enters_one & enters_other, (meet_other < meet_one) == concave, enters_other)
+    # Convex: entered at the later of two, or in the one that is met before the other is left; left at the earlier.
+    of_two = (meet_other < meet_one) == (concave == enters_one)
+    takes_other = jnp.where(enters_one == enters_other, of_two, enters_other)
     into, out = jnp.where(enters_one, meet_one, meet_other), jnp.where(enters_one, meet_other, meet_one)
-    misses = jnp.where(enters_one != enters_other, ~concave & (into > out), ~enters_one)
+    misses = (enters_one != enters_other) & ~concave & (into > out)
     return jnp.where(edge, jnp.where(misses, PASSED, jnp.where(takes_other, other, one)), word)

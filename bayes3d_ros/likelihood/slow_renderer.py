@@ -135,14 +135,15 @@ def _meet(
 
 
 def _at_edge(first: Meeting, second: Meeting, concave: Bool[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Where rays enter the solid at an edge: what lies behind both planes, or behind either (concave). inf where they
-    do not."""
+    """Where rays enter the solid at an edge: what lies behind both planes, or behind either (concave). Where they leave
+    it if they enter neither plane, as a sheet is met from behind too. inf where they pass."""
     enter = [np.where(plane.enters, plane.depth, -np.inf) for plane in (first, second)]
     leave = [np.where(plane.enters, np.inf, plane.depth) for plane in (first, second)]
     into, out = np.maximum(*enter), np.minimum(*leave)
     convex = np.where(into <= out, into, np.inf)
     either = np.minimum(*(np.where(plane.enters, plane.depth, np.inf) for plane in (first, second)))
-    return np.where(first.enters | second.enters, np.where(concave, either, convex), np.inf)
+    last = np.where(concave, np.maximum(first.depth, second.depth), np.minimum(first.depth, second.depth))
+    return np.where(first.enters | second.enters, np.where(concave, either, convex), last)
 
 
 def _surface_hit(

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
+from bayes3d_ros.geometry.directions import spread_directions
+
 MOST_CORNERS = 512
 _ROUNDING = 1e-3  # voxels beyond a plane that rays may meet another one, as they are float32
 
@@ -20,19 +22,11 @@ def hull(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "C 3"]:
     corners = _extreme(points)
     if len(corners) <= MOST_CORNERS:
         return corners
-    directions = _directions((MOST_CORNERS + 4) // 2)  # Euler: a solid of F faces has 2 F - 4 corners at most
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = (MOST_CORNERS + 4) // 2  # Euler: a solid of F faces has 2 F - 4 corners at most
+    directions = np.concatenate([axes, spread_directions(faces - len(axes))])
     sides = np.column_stack([directions, -(corners @ directions.T).max(0)])
     return np.unique(HalfspaceIntersection(sides, corners.mean(0)).intersections, axis=0)
-
-
-def _directions(count: int) -> Float[np.ndarray, "count 3"]:
-    """Spread evenly: a spiral from pole to pole (Gonzalez, Measurement of areas on a sphere using Fibonacci lattices,
-    2010), and the axes."""
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    place = np.arange(count - len(axes)) + 0.5
-    z, turn = 1 - 2 * place / len(place), np.pi * (3 - np.sqrt(5)) * place
-    spiral = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
-    return np.concatenate([axes, spiral])
 
 
 def _extreme(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "C 3"]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from bayes3d_ros.geometry.edges import AROUND
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.objects.empty_boxes import empty_boxes
 from bayes3d_ros.objects.hull import MOST_CORNERS, cube_corners, cut_corners, hull, patch_corners
@@ -19,7 +20,7 @@ from bayes3d_ros.objects.self_symmetry import self_symmetry
 
 NUM_FACES = 6
 OFFSET_RANGE = 0.5 * np.sqrt(3.0)  # a plane offset stays within half a voxel's diagonal
-INFLATION = 0.2  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
+INFLATION = AROUND  # voxels that a plane goes on beyond its cube, which closes the cracks between planes
 BOX_LOOSE = 0.02  # voxels that rays are met beyond the object's box, in which faces lie
 SURFACE_SAMPLES = 96  # of a type, for the coarse score
 EMPTY = -127 << 24  # words below are those of empty voxels
@@ -131,14 +132,14 @@ def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
     inside[tuple(model.surface_index.T)] = False
     reach = 0.5 + INFLATION
     front = _in_voxels(model.surface_normal, model.surface_offset, model)
-    back = _in_voxels(model.back_normal, model.back_offset, model)
-    cut = model.back_at_edge & ~model.back_concave
-    edge = model.back_row[cut]
+    back = _in_voxels(model.second_normal, model.second_offset, model)
+    cut = model.at_edge & ~model.concave
+    edge = model.second_row[cut]
     whole = np.setdiff1d(np.arange(len(model.surface_index)), edge)
     planes = (front[0][edge], front[1][edge]), (back[0][cut], back[1][cut])
     patches = [
         patch_corners(model.surface_index[whole], front[0][whole], front[1][whole], reach),
-        patch_corners(model.back_index[~cut], back[0][~cut], back[1][~cut], reach),
+        patch_corners(model.second_index[~cut], back[0][~cut], back[1][~cut], reach),
         *(cut_corners(model.surface_index[edge], *pair, reach) for pair in (planes, planes[::-1])),
     ]
     return hull(np.concatenate([*patches, cube_corners(np.argwhere(inside))]))

@@ -5,17 +5,18 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
+from bayes3d_ros.geometry.edges import CONCAVE, CONVEX, WALL
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
 from bayes3d_ros.lists import first_few
 
 _SMALLEST_VOXEL, _LARGEST = 1e-6, 1e5  # metres (of indices: voxels); float32 squares of these are finite
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]+")
 _NAMES_TOLD = 6  # of a library, in a line about a name that it does not hold
-OPPOSITE = -0.3  # cosine between the two planes of a voxel, up to which they are both sides of a wall
 UNKNOWN = "unknown"  # the type of things of no type in the library: no model may have this name, in any case
 
 
@@ -30,10 +31,10 @@ class ObjectModel:
     Voxel (i, j, k) is the cube [origin + voxel_size * (i, j, k), + voxel_size]. `occupancy` is the solid with its
     cavities open (the inside of a mug is not occupied). Every surface voxel carries a plane fitted to the piece of
     surface inside it, normal . (x - centre_of_voxel) = offset, so that a coarse grid still renders a smooth and
-    accurate surface; normals point out of the solid where that is known. A voxel of `back_index` holds two pieces of
-    surface, and `back_normal` and `back_offset` are the plane of the one with less area: the other side of a thin wall,
-    or of an edge, at which the solid is what lies behind both planes or (`back_concave`) behind either
-    (`second_planes.py`).
+    accurate surface; normals point out of the solid where that is known. A voxel of `second_index` holds two pieces of
+    surface, and `second_normal` and `second_offset` are the plane of the one with less area. `second_kind` says what it
+    is: the other side of a thin WALL, or of an edge, at which the solid is what lies behind both planes (CONVEX) or
+    behind either (CONCAVE; `geometry/edges.py`, `second_planes.py`).
 
     `box` is a stored box around the object; its face k = 0..5 is its +x -x +y -y +z -z side. An object that touches the
     table with face k rests with `contact_normal[k]` pointing straight down: the resting facet of the convex hull
@@ -55,10 +56,10 @@ class ObjectModel:
     contact_height: Float[np.ndarray, "6"]
     provenance: dict = field(default_factory=dict)  # where it came from; JSON values
     surface_views: Int[np.ndarray, "S"] | None = None  # how many views saw each surface voxel; None: not learned
-    back_index: Int[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3), int))  # some of surface_index
-    back_normal: Float[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    back_offset: Float[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0))  # metres
-    back_concave: Bool[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0, bool))
+    second_index: Int[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3), int))  # some of surface_index
+    second_normal: Float[np.ndarray, "B 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    second_offset: Float[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0))  # metres
+    second_kind: Integer[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     def __post_init__(self) -> None:
         _check(self)
@@ -67,30 +68,35 @@ class ObjectModel:
     def surface_points(self) -> Float[np.ndarray, "S 3"]:
         """One point on the surface for every surface voxel, in the object frame."""
         centres = self.origin + (self.surface_index + 0.5) * self.voxel_size
-        return centres + self.surface_normal * self.surface_offset[:, None] + self._back_to_edges()
+        return centres + self.surface_normal * self.surface_offset[:, None] + self._to_edges()
 
-    @property
-    def back_row(self) -> Int[np.ndarray, "B"]:
-        """Which of the surface voxels those of `back_index` are."""
+    @cached_property
+    def second_row(self) -> Int[np.ndarray, "B"]:
+        """Which of the surface voxels those of `second_index` are."""
         row_of = np.full(self.occupancy.shape, -1)
         row_of[tuple(self.surface_index.T)] = np.arange(len(self.surface_index))
-        return row_of[tuple(self.back_index.T)]
+        return row_of[tuple(self.second_index.T)]
 
     @property
-    def back_at_edge(self) -> Bool[np.ndarray, "B"]:
-        """Whether the two planes of a voxel of `back_index` meet at an edge; else they are both sides of a wall."""
-        return np.einsum("ij,ij->i", self.surface_normal[self.back_row], self.back_normal) > OPPOSITE
+    def at_edge(self) -> Bool[np.ndarray, "B"]:
+        """Whether the two planes of a voxel of `second_index` meet at an edge; else they are both sides of a wall."""
+        return self.second_kind != WALL
 
-    def _back_to_edges(self) -> Float[np.ndarray, "S 3"]:
+    @property
+    def concave(self) -> Bool[np.ndarray, "B"]:
+        """Whether they meet at an edge that is concave."""
+        return self.second_kind == CONCAVE
+
+    def _to_edges(self) -> Float[np.ndarray, "S 3"]:
         """From the point of each voxel's plane that is nearest to its middle to where the surface ends, if the point
         lies beyond an edge. Metres."""
         moved = np.zeros((len(self.surface_index), 3))
-        edge = self.back_at_edge
-        row, other = self.back_row[edge], self.back_normal[edge]
+        edge = self.at_edge
+        row, other = self.second_row[edge], self.second_normal[edge]
         normal = self.surface_normal[row]
         alike = np.einsum("ij,ij->i", normal, other)
-        beyond = alike * self.surface_offset[row] - self.back_offset[edge]  # along the other plane's normal
-        beyond = np.where(self.back_concave[edge], np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
+        beyond = alike * self.surface_offset[row] - self.second_offset[edge]  # along the other plane's normal
+        beyond = np.where(self.concave[edge], np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
         moved[row] = -(beyond / np.maximum(1 - alike**2, 0.1))[:, None] * (other - alike[:, None] * normal)
         return moved
 
@@ -113,7 +119,7 @@ def _check(model: ObjectModel) -> None:
         raise ValueError(f"occupancy must be a 3D bool array with a voxel set, got shape {model.occupancy.shape}")
     if model.occupancy.size > MAX_VOXELS:
         raise ValueError(f"occupancy may have {MAX_VOXELS} voxels at most, got shape {model.occupancy.shape}")
-    count, backs = len(model.surface_index), len(model.back_index)
+    count, seconds = len(model.surface_index), len(model.second_index)
     if count == 0:
         raise ValueError("surface_index must name at least one voxel")
     shapes = {
@@ -125,10 +131,10 @@ def _check(model: ObjectModel) -> None:
         "box_size": (3,),
         "contact_normal": (6, 3),
         "contact_height": (6,),
-        "back_index": (backs, 3),
-        "back_normal": (backs, 3),
-        "back_offset": (backs,),
-        "back_concave": (backs,),
+        "second_index": (seconds, 3),
+        "second_normal": (seconds, 3),
+        "second_offset": (seconds,),
+        "second_kind": (seconds,),
     }
     for name, shape in shapes.items():
         value = getattr(model, name)
@@ -140,11 +146,11 @@ def _check(model: ObjectModel) -> None:
             raise ValueError(f"{name} holds {np.abs(value).max():g}, expected {_LARGEST:g} at most")
     if (model.surface_index < 0).any() or (model.surface_index >= model.occupancy.shape).any():
         raise ValueError(f"surface_index points outside the grid of {model.occupancy.shape} voxels")
-    _check_backs(model)
-    for name in ("surface_normal", "back_normal", "contact_normal"):
+    _check_seconds(model)
+    for name in ("surface_normal", "second_normal", "contact_normal"):
         if not np.allclose(np.linalg.norm(getattr(model, name), axis=1), 1, atol=1e-3):
             raise ValueError(f"{name} must hold unit vectors")
-    for name in ("surface_offset", "back_offset"):
+    for name in ("surface_offset", "second_offset"):
         if (np.abs(getattr(model, name)) > np.sqrt(3) / 2 * model.voxel_size * 1.001).any():
             raise ValueError(f"{name} lies outside its voxel")
     if model.surface_views is not None and model.surface_views.shape != model.surface_offset.shape:
@@ -156,12 +162,16 @@ def _check(model: ObjectModel) -> None:
         raise ValueError("box_size must be positive")
 
 
-def _check_backs(model: ObjectModel) -> None:
+def _check_seconds(model: ObjectModel) -> None:
     surface = np.zeros(model.occupancy.shape, bool)
     surface[tuple(model.surface_index.T)] = True
-    inside = (model.back_index >= 0).all() and (model.back_index < model.occupancy.shape).all()
-    if not inside or not surface[tuple(model.back_index.T)].all():
-        raise ValueError("back_index names a voxel that is not one of surface_index")
+    inside = (model.second_index >= 0).all() and (model.second_index < model.occupancy.shape).all()
+    if not inside or not surface[tuple(model.second_index.T)].all():
+        raise ValueError("second_index names a voxel that is not one of surface_index")
+    if not np.isin(model.second_kind, (WALL, CONVEX, CONCAVE)).all():
+        raise ValueError(
+            f"second_kind must be {WALL}, {CONVEX} or {CONCAVE}, got {np.unique(model.second_kind)[:_NAMES_TOLD]}"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Voxels that hold two pieces of surface (`ObjectModel.back_index`): which side of a thin wall rays meet, and where
+"""Voxels that hold two pieces of surface (`ObjectModel.second_index`): which side of a thin wall rays meet, and where
 they meet the solid at an edge."""
 
 from typing import NamedTuple
@@ -32,17 +32,17 @@ def octants(directions: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 
 def planes_met(model: ObjectModel) -> tuple[Float[np.ndarray, "8 S 3"], Float[np.ndarray, "8 S"]]:
     """Normals, and offsets in metres, of the planes of all surface voxels, as rays of each octant meet them: of a thin
-    wall that of `back_index` where the voxel's other plane faces away."""
-    row, edge = model.back_row, model.back_at_edge
+    wall that of `second_index` where the voxel's other plane faces away."""
+    row, edge = model.second_row, model.at_edge
     middle = _SIGNS / np.sqrt(3)
-    met = (middle @ model.surface_normal[row].T > _AWAY) & (middle @ model.back_normal.T < _FACING) & ~edge
+    met = (middle @ model.surface_normal[row].T > _AWAY) & (middle @ model.second_normal.T < _FACING) & ~edge
     normal, offset = (np.repeat(front[None], len(middle), 0) for front in (model.surface_normal, model.surface_offset))
     octant, back = np.nonzero(met)
-    normal[octant, row[back]], offset[octant, row[back]] = model.back_normal[back], model.back_offset[back]
+    normal[octant, row[back]], offset[octant, row[back]] = model.second_normal[back], model.second_offset[back]
     return normal, offset
 
 
 def edge_planes(model: ObjectModel) -> EdgePlanes:
     """The second planes of voxels that hold an edge."""
-    edge = model.back_at_edge
-    return EdgePlanes(model.back_row[edge], model.back_normal[edge], model.back_offset[edge], model.back_concave[edge])
+    edge = model.at_edge
+    return EdgePlanes(model.second_row[edge], model.second_normal[edge], model.second_offset[edge], model.concave[edge])

@@ -13,10 +13,11 @@ from jaxtyping import Float, Int
 
 from bayes3d_ros.files.atomic import write_whole
 from bayes3d_ros.files.npz_file import read_arrays, write_arrays
+from bayes3d_ros.geometry.edges import WALL
 from bayes3d_ros.geometry.voxels import MAX_VOXELS
 from bayes3d_ros.objects.model import Library, LibraryError, ObjectModel
 
-FORMAT_VERSION = 1
+FORMATS = 1, 2  # 2 has edges, which readers of 1 would take for walls
 
 
 def refuse_existing(folder: Path, *names: str) -> None:
@@ -57,7 +58,7 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
     if surface.sum() != len(model.surface_index):
         raise ValueError("surface_index names a voxel twice")
     meta = {
-        "format": FORMAT_VERSION,
+        "format": FORMATS[int(model.at_edge.any())],
         "name": model.name,
         "voxel_size": float(model.voxel_size),
         "provenance": model.provenance,
@@ -74,14 +75,14 @@ def save_model(model: ObjectModel, folder: Path, *, replace: bool = False) -> Pa
         ).astype(np.float64),
         "contact_normal": model.contact_normal.astype(np.float64),
     }
-    if len(model.back_index):  # files of versions before have none, and those versions read past it
-        back = np.ravel_multi_index(tuple(model.back_index.T), shape)
+    if len(model.second_index):
+        back = np.ravel_multi_index(tuple(model.second_index.T), shape)
         own = np.argsort(back)
         arrays["back"] = np.packbits(np.isin(np.flatnonzero(surface), back, assume_unique=True))
-        arrays["back_normal"] = _normal_bytes(model.back_normal[own])
-        arrays["back_offset"] = _offset_bytes(model.back_offset[own], model.voxel_size)
-        if model.back_concave.any():
-            arrays["back_concave"] = np.packbits(model.back_concave[own])
+        arrays["back_normal"] = _normal_bytes(model.second_normal[own])
+        arrays["back_offset"] = _offset_bytes(model.second_offset[own], model.voxel_size)
+        if model.at_edge.any():
+            arrays["back_kind"] = model.second_kind[own].astype(np.uint8)
     if model.surface_views is not None:
         arrays["surface_views"] = np.minimum(model.surface_views[order], 255).astype(np.uint8)
     path = model_path(folder, model.name)
@@ -147,7 +148,7 @@ _TYPES: dict[str, Any] = {
     "back": np.uint8,
     "back_normal": np.int8,
     "back_offset": np.int8,
-    "back_concave": np.uint8,
+    "back_kind": np.uint8,
 }
 
 
@@ -172,19 +173,16 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
     index = np.argwhere(masks["surface"])
     normal, offset = _planes(arrays, "surface", len(index), voxel_size)
     frames = arrays["frames"]
-    backs = {}
+    seconds: dict[str, np.ndarray] = {}
     if "back" in arrays:
         if arrays["back"].shape != ((len(index) + 7) // 8,):
             raise ValueError(f"back must hold {(len(index) + 7) // 8} bytes for {len(index)} surface voxels")
-        backs["back_index"] = index[np.unpackbits(arrays["back"], count=len(index)).astype(bool)]
-        planes = _planes(arrays, "back", len(backs["back_index"]), voxel_size)
-        backs["back_normal"], backs["back_offset"] = planes
-        count = len(backs["back_index"])
-        backs["back_concave"] = np.zeros(count, bool)  # files of versions before have none
-        if "back_concave" in arrays:
-            if arrays["back_concave"].shape != ((count + 7) // 8,):
-                raise ValueError(f"back_concave must hold {(count + 7) // 8} bytes for {count} second planes")
-            backs["back_concave"] = np.unpackbits(arrays["back_concave"], count=count).astype(bool)
+        own = index[np.unpackbits(arrays["back"], count=len(index)).astype(bool)]
+        kind = arrays.get("back_kind", np.full(len(own), WALL, np.uint8))
+        if kind.shape != (len(own),):
+            raise ValueError(f"back_kind must describe {len(own)} voxels")
+        normal_of, offset_of = _planes(arrays, "back", len(own), voxel_size)
+        seconds = {"second_index": own, "second_normal": normal_of, "second_offset": offset_of, "second_kind": kind}
     if frames.shape != (24,):
         raise ValueError(f"frames must hold 24 numbers, got {frames.shape}")
     return ObjectModel(
@@ -201,7 +199,7 @@ def _decode(arrays: dict[str, np.ndarray]) -> ObjectModel:
         contact_height=frames[18:],
         provenance=meta["provenance"],
         surface_views=arrays["surface_views"].astype(int) if "surface_views" in arrays else None,
-        **backs,
+        **seconds,
     )
 
 
@@ -212,8 +210,8 @@ def _decode_meta(array: np.ndarray) -> dict:
         raise ValueError(f"meta must be JSON ({error})") from error
     if not isinstance(meta, dict):
         raise ValueError("meta must be a JSON object")
-    if meta["format"] != FORMAT_VERSION:
-        raise ValueError(f"format version {meta['format']}, expected {FORMAT_VERSION}")
+    if meta["format"] not in FORMATS:
+        raise ValueError(f"format version {meta['format']}, expected {FORMATS[0]} or {FORMATS[1]}")
     if not isinstance(meta["voxel_size"], float):
         raise ValueError(f"voxel_size must be a number of metres, got {meta['voxel_size']!r}")
     return meta

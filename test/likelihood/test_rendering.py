@@ -56,7 +56,7 @@ def centred(model, pose):
 def as_packed(model):
     """The model with its planes rounded to 8 bits, as `library_arrays` packs them."""
     packed, unit = copy.copy(model), OFFSET_RANGE * model.voxel_size / 127
-    for side in ("surface", "back"):
+    for side in ("surface", "second"):
         object.__setattr__(packed, f"{side}_normal", np.rint(getattr(model, f"{side}_normal") * 127) / 127)
         object.__setattr__(packed, f"{side}_offset", np.rint(getattr(model, f"{side}_offset") / unit) * unit)
     return packed
@@ -220,6 +220,20 @@ def test_inner_edges_are_where_faces_meet(seed):
     assert np.quantile(away, 0.99) < 0.035
     assert (away > 0.05).mean() < 0.003
     assert (np.isfinite(depth) != np.isfinite(exact)).sum() < 15
+
+
+def test_a_box_of_sheets_without_a_top_has_no_holes():
+    """Rays that look into it meet its sheets from behind, at inner edges too."""
+    box = trimesh.creation.box((0.10, 0.08, 0.06))
+    box.update_faces(box.face_normals[:, 2] < 0.9)
+    model = model_from_mesh(box, "tray", 0.003)
+    assert model.at_edge.any()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.diag([1.0, -1.0, -1.0]), (0, 0, 0.5)
+    x, y = pixel_rays(100, 450.0)
+    depth = depth_of(model, pose, x, y)
+    own = (np.abs(x * 0.53) < 0.05) & (np.abs(y * 0.53) < 0.04)
+    assert own.sum() > 4000 and np.isfinite(depth[own]).all()
 
 
 def test_outlines_of_a_box(cast, library):

@@ -17,8 +17,8 @@ def solid(library: Library, occupancy: np.ndarray) -> ObjectModel:
     inside = np.argwhere(occupancy)[:1]
     return replace(
         model, occupancy=occupancy, surface_index=inside, surface_normal=np.array([[0.0, 0, 1]]), surface_views=None,
-        surface_offset=np.zeros(1), back_index=np.zeros((0, 3), int), back_normal=np.zeros((0, 3)),
-        back_offset=np.zeros(0), back_concave=np.zeros(0, bool),
+        surface_offset=np.zeros(1), second_index=np.zeros((0, 3), int), second_normal=np.zeros((0, 3)),
+        second_offset=np.zeros(0), second_kind=np.zeros(0, np.uint8),
     )  # fmt: skip
 
 

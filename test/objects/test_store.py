@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from bayes3d_ros.geometry.edges import CONCAVE, CONVEX, WALL
 from bayes3d_ros.objects import store
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import LibraryError
@@ -41,13 +42,13 @@ def test_round_trip(model, tmp_path):
     read = load_model(path)
     for name in ("name", "voxel_size", "provenance"):
         assert getattr(read, name) == getattr(model, name)
-    assert model.back_concave.any() and not model.back_concave.all()
-    for name in ("occupancy", "surface_index", "back_index", "back_concave"):
+    assert set(model.second_kind) == {WALL, CONVEX, CONCAVE}
+    for name in ("occupancy", "surface_index", "second_index", "second_kind"):
         np.testing.assert_array_equal(getattr(read, name), getattr(model, name))
     for name in ("origin", "T_object_box", "box_size", "contact_normal", "contact_height"):
         np.testing.assert_allclose(getattr(read, name), getattr(model, name), atol=1e-12)
-    assert len(model.back_index) > 100  # of the thin wall
-    for side in ("surface", "back"):
+    assert len(model.second_index) > 100  # of the thin wall
+    for side in ("surface", "second"):
         normal, written = getattr(read, f"{side}_normal"), getattr(model, f"{side}_normal")
         assert np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normal, written), -1, 1))).max() < 0.4
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1)
@@ -55,11 +56,24 @@ def test_round_trip(model, tmp_path):
         assert np.abs(off).max() <= 0.5001 * np.sqrt(3) / 2 * 0.005 / 127
 
 
+def test_a_file_holds_what_planes_of_a_voxel_are(tmp_path):
+    """Of a prism whose sides meet at an angle near the sharpest that makes an edge: rounded normals would not tell."""
+    angle = np.radians(72.6)
+    outline = [(0, 0), (0.08, 0), (0.04, 0.04 * np.tan(angle))]
+    prism = trimesh.creation.extrude_triangulation(np.array(outline), [(0, 1, 2)], 0.05)
+    model = model_from_mesh(prism, "prism", 0.003)
+    path = save_model(model, tmp_path)
+    assert meta_of(path).tobytes().count(b'"format": 2') == 1  # who reads format 1 would take edges for walls
+    assert model.at_edge.sum() > 100
+    np.testing.assert_array_equal(load_model(path).second_kind, model.second_kind)
+
+
 def test_files_without_planes_of_second_sides_are_read(model, tmp_path):
     path = save_model(model, tmp_path)
-    rewrite(path, back=None, back_normal=None, back_offset=None, back_concave=None)
+    rewrite(path, back=None, back_normal=None, back_offset=None, back_kind=None)
+    rewrite(path, meta=meta_of(path, format=1))
     read = load_model(path)
-    assert len(read.back_index) == 0 and len(read.surface_index) == len(model.surface_index)
+    assert len(read.second_index) == 0 and len(read.surface_index) == len(model.surface_index)
 
 
 def test_files_do_not_change_when_read_and_written_again(model, tmp_path):
@@ -71,11 +85,14 @@ def test_files_do_not_change_when_read_and_written_again(model, tmp_path):
 def test_the_order_of_surface_voxels_does_not_matter(model, tmp_path):
     order = np.random.default_rng(0).permutation(len(model.surface_index))
     fields = ("surface_index", "surface_normal", "surface_offset")
-    backs = np.random.default_rng(1).permutation(len(model.back_index))
+    seconds = np.random.default_rng(1).permutation(len(model.second_index))
     shuffled = dataclasses.replace(
         model,
         **{name: getattr(model, name)[order] for name in fields},
-        **{f"back_{name}": getattr(model, f"back_{name}")[backs] for name in ("index", "normal", "offset", "concave")},
+        **{
+            f"second_{name}": getattr(model, f"second_{name}")[seconds]
+            for name in ("index", "normal", "offset", "kind")
+        },
     )
     assert save_model(model, tmp_path / "a").read_bytes() == save_model(shuffled, tmp_path / "b").read_bytes()
 
@@ -233,6 +250,7 @@ def test_a_plain_array_is_refused(tmp_path):
         ({"surface_offset": np.zeros(4, np.int8)}, "must describe"),
         ({"back": np.zeros(2, np.uint8)}, "back must hold"),
         ({"back_offset": np.zeros(4, np.int8)}, "back_normal and back_offset must describe"),
+        ({"back_kind": np.zeros(4, np.uint8)}, "back_kind must describe"),
         ({"back_normal": None}, "the field 'back_normal' is missing"),
         ({"contact_normal": np.zeros((5, 3))}, "contact_normal must have shape"),
         ({"contact_normal": np.zeros((6, 3))}, "contact_normal must hold unit vectors"),
@@ -253,7 +271,7 @@ def test_wrong_fields_are_named(model, tmp_path, changes, reason):
 @pytest.mark.parametrize(
     "changes, reason",
     [
-        ({"format": 99}, "format version 99, expected 1"),
+        ({"format": 99}, "format version 99, expected 1 or 2"),
         ({"name": "../etc"}, "name must be made of"),
         ({"name": "a.b"}, "name must be made of"),
         ({"name": ""}, "name must be made of"),
@@ -280,15 +298,15 @@ def test_wrong_meta_is_named(model, tmp_path, changes, reason):
         ({"box_size": np.array([0.1, 0.0, 0.1])}, "box_size"),
         ({"T_object_box": np.diag([1.0, 1, -1, 1])}, "rigid"),
         ({"origin": np.zeros(4)}, "origin must have shape"),
-        ({"back_index": np.full((1, 3), -1)}, "back_normal must have shape"),
+        ({"second_index": np.full((1, 3), -1)}, "second_normal must have shape"),
         (
             {
-                "back_index": np.full((1, 3), 99),
-                "back_normal": np.eye(3)[:1],
-                "back_offset": np.zeros(1),
-                "back_concave": np.zeros(1, bool),
+                "second_index": np.full((1, 3), 99),
+                "second_normal": np.eye(3)[:1],
+                "second_offset": np.zeros(1),
+                "second_kind": np.zeros(1, np.uint8),
             },
-            "back_index",
+            "second_index",
         ),
     ],
 )

@@ -128,11 +128,11 @@ def _at_edge(words, edges, word, a, b, c, ra, rb, rc):
     meet_one, enters_one = _meet(one, a, b, c, ra, rb, rc)
     meet_other, enters_other = _meet(other, a, b, c, ra, rb, rc)
     concave = (number & i32(1)) == i32(1)
-    if enters_one and enters_other:
-        return other if (meet_other < meet_one) == concave else one
+    if enters_one == enters_other:
+        return other if (meet_other < meet_one) == (concave == enters_one) else one
     if enters_other:
         return other if concave or meet_other <= meet_one else i32(PASSED)
-    return one if enters_one and (concave or meet_one <= meet_other) else i32(PASSED)
+    return one if concave or meet_one <= meet_other else i32(PASSED)
 
 
 @inlined
