@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayes3d_ros.geometry.mesh import SurfaceSamples
+from bayes3d_ros.geometry.voxel_grid import VoxelGrid
 
 SAME_SHEET = -0.3  # cosine between normals of one sheet and of a voxel's plane, at least
 
@@ -23,21 +24,16 @@ class Patches(NamedTuple):
     area: Float[np.ndarray, "S"]  # square metres
 
 
-def fit_planes(
-    samples: SurfaceSamples, origin: Float[np.ndarray, "3"], voxel_size: float, shape: tuple[int, ...]
-) -> Patches:
+def fit_planes(samples: SurfaceSamples, grid: VoxelGrid) -> Patches:
     """A plane in every voxel that holds a sample, fitted to the samples in and closely around the voxel.
 
     Samples are weighted by a Gaussian around the centroid of those in the voxel, so that planes of neighbours agree.
     Where two sheets of a thin wall share a voxel, the plane is that of the sheet with more area in it.
     """
-    position = (samples.points - origin) / voxel_size
-    cell = cells_of(position, shape)
-    keys, row = np.unique(np.ravel_multi_index(tuple(cell.T), shape), return_inverse=True)
-    index = np.stack(np.unravel_index(keys, shape), 1)
-    count = len(keys)
-    row_of = np.full(np.array(shape) + 2, -1)
-    row_of[tuple(index.T + 1)] = np.arange(count)
+    position, cell = grid.positions(samples.points), grid.cells(samples.points)
+    keys, row = np.unique(grid.flat(cell), return_inverse=True)
+    index = np.stack(np.unravel_index(keys, grid.shape), 1)
+    count, row_of = len(keys), grid.row_of(index)
 
     reference = _reference_normals(samples.normals, row, count)
     same = np.einsum("ij,ij->i", samples.normals, reference[row]) > SAME_SHEET
@@ -50,7 +46,7 @@ def fit_planes(
     mean_normal = np.zeros((count, 3))
     side = np.where(position - cell < 0.5, -1, 1)  # the 8 voxels whose half-voxel surroundings hold the sample
     for step in itertools.product((0, 1), repeat=3):
-        target = row_of[tuple((cell + side * step + 1).T)]
+        target = row_of(cell + side * step)
         sample = np.flatnonzero(target >= 0)
         target = target[sample]
         away = position[sample] - centroid[target]
@@ -70,12 +66,7 @@ def fit_planes(
     limit = np.sqrt(3) / 2
     offset = np.clip(np.einsum("ij,ij->i", normal, local), -limit, limit)
     area = np.bincount(row, minlength=count) * samples.area
-    return Patches(index, normal, offset * voxel_size, (centroid - index - 0.5) * voxel_size, area)
-
-
-def cells_of(position: Float[np.ndarray, "N 3"], shape: tuple[int, ...]) -> Int[np.ndarray, "N 3"]:
-    """The voxels that hold these points, in voxels from the grid's origin."""
-    return np.clip(np.floor(position).astype(int), 0, np.array(shape) - 1)
+    return Patches(index, normal, offset * grid.voxel_size, (centroid - index - 0.5) * grid.voxel_size, area)
 
 
 def _reference_normals(

@@ -12,7 +12,8 @@ from scipy import ndimage
 
 from bayes3d_ros.geometry.edges import CONCAVE, CONVEX, WALL, find_edges
 from bayes3d_ros.geometry.mesh import MeshError, SurfaceSamples, sample_surface, size_problem, wound_outward
-from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, cells_of, fit_planes
+from bayes3d_ros.geometry.planes import SAME_SHEET, Patches, fit_planes
+from bayes3d_ros.geometry.voxel_grid import VoxelGrid
 
 MAX_VOXELS = 2**24 - 1  # up to there a float32 counts them one by one
 _SAMPLES_PER_EDGE = 6  # surface samples are this many times denser than voxels
@@ -58,15 +59,16 @@ def voxelize(mesh: trimesh.Trimesh, voxel_size: float) -> VoxelSolid:
     origin = (low + high) / 2 - shape * voxel_size / 2
     mesh = wound_outward(mesh)
     samples = sample_surface(mesh, voxel_size / _SAMPLES_PER_EDGE)
-    patches = fit_planes(samples, origin, voxel_size, tuple(shape.tolist()))
+    grid = VoxelGrid(origin, tuple(shape.tolist()), float(voxel_size))
+    patches = fit_planes(samples, grid)
     touched = np.zeros(shape, bool)
     touched[tuple(patches.voxel.T)] = True
     occupancy = fill_enclosed(touched)
-    drop = _redundant(patches, voxel_size, touched.shape)
+    drop = _redundant(patches, grid)
     occupancy[tuple(patches.voxel[drop].T)] = patches.offset[drop] > 0  # where the centre lies behind the surface
     kept = Patches(*(part[~drop] for part in patches))
-    front, second = two_planes(samples, kept, origin, voxel_size, occupancy.shape, bool(mesh.is_winding_consistent))
-    return VoxelSolid(float(voxel_size), origin, occupancy, front.voxel, front.normal, front.offset, *second)
+    front, second = two_planes(samples, kept, grid, bool(mesh.is_winding_consistent))
+    return VoxelSolid(grid.voxel_size, origin, occupancy, front.voxel, front.normal, front.offset, *second)
 
 
 def fill_enclosed(surface: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
@@ -84,19 +86,12 @@ class SecondPlanes(NamedTuple):
     kind: Integer[np.ndarray, "B"]
 
 
-def two_planes(
-    samples: SurfaceSamples,
-    kept: Patches,
-    origin: Float[np.ndarray, "3"],
-    voxel_size: float,
-    shape: tuple[int, ...],
-    oriented: bool,
-) -> tuple[Patches, SecondPlanes]:
+def two_planes(samples: SurfaceSamples, kept: Patches, grid: VoxelGrid, oriented: bool) -> tuple[Patches, SecondPlanes]:
     """The planes of voxels with a single piece of surface, and of the larger piece where there are two; and those of
     the smaller pieces. oriented: whether normals agree on which side the solid is; else nothing meets at an edge."""
-    back = _back_sheets(samples, kept, origin, voxel_size, shape)
+    back = _back_sheets(samples, kept, grid)
     unoriented = SurfaceSamples(samples.points[:0], samples.normals[:0], samples.area)
-    edges = find_edges(samples if oriented else unoriented, kept, back, origin, voxel_size, shape)
+    edges = find_edges(samples if oriented else unoriented, kept, back, grid)
     normal, offset = kept.normal.copy(), kept.offset.copy()
     normal[edges.row], offset[edges.row] = edges.normal[:, 0], edges.offset[:, 0]
     second = SecondPlanes(
@@ -109,37 +104,29 @@ def two_planes(
     return kept._replace(normal=normal, offset=offset), SecondPlanes(*(part[order] for part in second))
 
 
-def _back_sheets(
-    samples: SurfaceSamples,
-    front: Patches,
-    origin: Float[np.ndarray, "3"],
-    voxel_size: float,
-    shape: tuple[int, ...],
-) -> Patches:
+def _back_sheets(samples: SurfaceSamples, front: Patches, grid: VoxelGrid) -> Patches:
     """Of voxels that hold both sides of a thin wall, the side that `front` does not have."""
-    row_of = np.full(shape, -1)
-    row_of[tuple(front.voxel.T)] = np.arange(len(front.voxel))
-    row = row_of[tuple(cells_of((samples.points - origin) / voxel_size, shape).T)]
+    row_of = grid.row_of(front.voxel)
+    row = row_of(grid.cells(samples.points))
     behind = (row >= 0) & (np.einsum("ij,ij->i", samples.normals, front.normal[row]) <= SAME_SHEET)
     if not behind.any():
         return Patches(*(part[:0] for part in front))
     others = samples._replace(points=samples.points[behind], normals=samples.normals[behind])
-    back = fit_planes(others, origin, voxel_size, shape)
-    facing = np.einsum("ij,ij->i", back.normal, front.normal[row_of[tuple(back.voxel.T)]])
-    found = (back.area > _LEAST_BACK * voxel_size**2) & (facing <= SAME_SHEET)
+    back = fit_planes(others, grid)
+    facing = np.einsum("ij,ij->i", back.normal, front.normal[row_of(back.voxel)])
+    found = (back.area > _LEAST_BACK * grid.voxel_size**2) & (facing <= SAME_SHEET)
     return Patches(*(part[found] for part in back))
 
 
-def _redundant(patches: Patches, voxel_size: float, shape: tuple[int, ...]) -> Bool[np.ndarray, "S"]:
+def _redundant(patches: Patches, grid: VoxelGrid) -> Bool[np.ndarray, "S"]:
     """Voxels that the surface only clips, where a neighbour's plane, within its reach, covers the clip."""
-    row_of = np.full(np.array(shape) + 2, -1)
-    row_of[tuple(patches.voxel.T + 1)] = np.arange(len(patches.voxel))
+    row_of, voxel_size = grid.row_of(patches.voxel), grid.voxel_size
     small = np.flatnonzero(patches.area < 0.1 * voxel_size**2)
     redundant = np.zeros(len(patches.voxel), bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
         if step == (0, 0, 0):
             continue
-        neighbour = row_of[tuple((patches.voxel[small] + 1 + step).T)]
+        neighbour = row_of(patches.voxel[small] + step)
         seen = patches.centroid[small] - np.array(step) * voxel_size  # from the neighbour's centre
         within = (np.abs(seen) < (0.5 + _REACH) * voxel_size).all(1)
         miss = np.abs(np.einsum("ij,ij->i", patches.normal[neighbour], seen) - patches.offset[neighbour])

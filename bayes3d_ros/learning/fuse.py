@@ -20,28 +20,11 @@ from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.planes import Patches, fit_planes
+from bayes3d_ros.geometry.voxel_grid import VoxelGrid
 from bayes3d_ros.geometry.voxels import VoxelSolid
 from bayes3d_ros.learning.fusion_constants import BEHIND_VOXEL, FEWEST_VOXELS, FOOT, GLIMPSE, HIT, LOW, PASS, THIN
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.tuning import TUNING
-
-
-class FusionGrid(NamedTuple):
-    """Voxels of a box in the table frame; the table is half a voxel above the box's base, in the lowest layer's middle:
-    a flat base on the face between two layers would be in both or in none."""
-
-    origin: Float[np.ndarray, "3"]
-    shape: tuple[int, int, int]
-    voxel_size: float
-
-    def voxel_of(self, points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
-        """Flat index of the voxel of each point."""
-        cell = np.clip(((points - self.origin) / self.voxel_size).astype(int), 0, np.array(self.shape) - 1)
-        return np.ravel_multi_index(tuple(cell.T), self.shape)
-
-    def centres(self) -> Float[np.ndarray, "V 3"]:
-        """In the order of flat indices."""
-        return self.origin + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.voxel_size
 
 
 class Fused(NamedTuple):
@@ -77,11 +60,11 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
     points, normals = (np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True))
-    index = grid.voxel_of(points)
+    index = grid.flat(grid.cells(points))
     kept = surface.ravel()[index]
     points, normals, index = points[kept], normals[kept], index[kept]
     area = voxel_size**2 / float(np.median(np.unique(index, return_counts=True)[1]))
-    patches = fit_planes(SurfaceSamples(points, normals, area), grid.origin, voxel_size, grid.shape)
+    patches = fit_planes(SurfaceSamples(points, normals, area), grid)
     noise = _noise_of_a_neighbour(patches, grid)
     voxel = patches.voxel[~noise]
     seen, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
@@ -97,12 +80,14 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     voxel = np.concatenate([voxel, unseen.voxel])
     normal = np.concatenate([patches.normal[~noise], unseen.normal])
     offset = np.concatenate([patches.offset[~noise], np.zeros(len(unseen.voxel))])
-    order = np.argsort(np.ravel_multi_index(tuple(voxel.T), grid.shape))
+    order = np.argsort(grid.flat(voxel))
     surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order])
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
 
 
-def _grid(surfaces: Sequence[Surface], voxel_size: float) -> FusionGrid:
+def _grid(surfaces: Sequence[Surface], voxel_size: float) -> VoxelGrid:
+    """Of a box in the table frame. The table is half a voxel above the box's base, in the lowest layer's middle: a flat
+    base on the face between two layers would be in both or in none."""
     points = np.concatenate([surface.points for surface in surfaces])
     low, high = points.min(0), points.max(0)
     low[:2], high = low[:2] - voxel_size, high + voxel_size
@@ -111,12 +96,12 @@ def _grid(surfaces: Sequence[Surface], voxel_size: float) -> FusionGrid:
     if shape.prod() > TUNING.most_voxels:
         size = " x ".join(f"{n}" for n in shape)
         raise FusionError(f"the object would fill a grid of {size} voxels: expected larger voxels than {voxel_size} m")
-    return FusionGrid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel_size)
+    return VoxelGrid(low, tuple(shape.tolist()), voxel_size)
 
 
-def _hits(surface: Surface, grid: FusionGrid) -> Int[np.ndarray, "V"]:
+def _hits(surface: Surface, grid: VoxelGrid) -> Int[np.ndarray, "V"]:
     """1 for voxels that hold points of this view. A single one may be a stray."""
-    return (np.bincount(grid.voxel_of(surface.points), minlength=int(np.prod(grid.shape))) > 1).astype(int)
+    return (np.bincount(grid.flat(grid.cells(surface.points)), minlength=int(np.prod(grid.shape))) > 1).astype(int)
 
 
 def _passed(
@@ -156,17 +141,16 @@ def _pieces(voxels: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     return (sizes >= min(FEWEST_VOXELS, int(sizes.max(initial=0))))[labels] & voxels
 
 
-def _noise_of_a_neighbour(patches: Patches, grid: FusionGrid) -> Bool[np.ndarray, "S"]:
+def _noise_of_a_neighbour(patches: Patches, grid: VoxelGrid) -> Bool[np.ndarray, "S"]:
     """Voxels that hold only the tail of a surface next door: points of one surface scatter over two layers."""
     voxel, normal, offset = patches.voxel, patches.normal, patches.offset
     times, near = THIN
-    row_of = np.full(np.array(grid.shape) + 2, -1)
-    row_of[tuple(voxel.T + 1)] = np.arange(len(voxel))
+    row_of = grid.row_of(voxel)
     noise = np.zeros(len(voxel), bool)
     for step in np.indices((3, 3, 3)).reshape(3, -1).T - 1:
         if not step.any():
             continue
-        other = row_of[tuple((voxel + 1 + step).T)]
+        other = row_of(voxel + step)
         seen = patches.centroid - step * grid.voxel_size  # from the neighbour's centre
         miss = np.abs(np.einsum("ij,ij->i", normal[other], seen) - offset[other])
         same = np.einsum("ij,ij->i", normal, normal[other]) > 0.5
@@ -185,7 +169,7 @@ def _hull(points: Float[np.ndarray, "N 3"]) -> ConvexHull:
         raise FusionError(f"the points seen have no volume ({str(error).splitlines()[0][:80]})") from None
 
 
-def _within(hull: ConvexHull, grid: FusionGrid) -> Bool[np.ndarray, "X Y Z"]:
+def _within(hull: ConvexHull, grid: VoxelGrid) -> Bool[np.ndarray, "X Y Z"]:
     """Voxels whose middles lie in the hull: between its highest and lowest plane of their column."""
     x, y, z = (grid.origin[k] + (np.arange(grid.shape[k]) + 0.5) * grid.voxel_size for k in range(3))
     low, high = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)

@@ -43,7 +43,7 @@ def render(
         edge, at = edge_of[cube], edge_of[cube] >= 0
         plane = edges.normal[edge[at]], edges.offset[edge[at]] / model.voxel_size
         second = _meet(plane, from_eye[cube[at]], directions[ray[at]])
-        meet = first[0]
+        meet = first.depth
         meet[at] = _at_edge(Meeting(*(part[at] for part in first)), second, edges.concave[edge[at]])
         np.minimum.at(depth, ray, _surface_hit(meet, from_eye[cube], directions[ray], way[ray], near))
     from_eye = np.argwhere(model.occupancy & ~surface) + 0.5 - eye

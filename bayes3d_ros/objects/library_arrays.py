@@ -132,14 +132,14 @@ def _hull(model: ObjectModel) -> Float[np.ndarray, "C 3"]:
     inside[tuple(model.surface_index.T)] = False
     reach = 0.5 + INFLATION
     front = _in_voxels(model.surface_normal, model.surface_offset, model)
-    back = _in_voxels(model.second_normal, model.second_offset, model)
+    second = _in_voxels(model.second_normal, model.second_offset, model)
     cut = model.at_edge & ~model.concave
     edge = model.second_row[cut]
     whole = np.setdiff1d(np.arange(len(model.surface_index)), edge)
-    planes = (front[0][edge], front[1][edge]), (back[0][cut], back[1][cut])
+    planes = (front[0][edge], front[1][edge]), (second[0][cut], second[1][cut])
     patches = [
         patch_corners(model.surface_index[whole], front[0][whole], front[1][whole], reach),
-        patch_corners(model.second_index[~cut], back[0][~cut], back[1][~cut], reach),
+        patch_corners(model.second_index[~cut], second[0][~cut], second[1][~cut], reach),
         *(cut_corners(model.surface_index[edge], *pair, reach) for pair in (planes, planes[::-1])),
     ]
     return hull(np.concatenate([*patches, cube_corners(np.argwhere(inside))]))

@@ -100,7 +100,7 @@ def test_the_foot_of_what_stands_upright_is_whole():
     seen = found.model.surface_views > 0
     wall = seen & (points[:, 2] > 0.005) & (points[:, 2] < 0.01) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.003)
     turn = np.degrees(np.arctan2(points[wall, 1], points[wall, 0])) % 360
-    assert len(np.unique(turn // 6)) >= 58, len(np.unique(turn // 6))  # of 60
+    assert len(np.unique(turn // 6)) >= 58  # of 60
 
 
 def test_what_no_view_saw_is_known(bracket):

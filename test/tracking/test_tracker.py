@@ -118,7 +118,7 @@ def test_a_camera_is_followed_lost_and_found_again(tracker, world, frame):
     # Of images this small one frame in a run may be off: in a tenth of 120 seeds by more than 6 mm, in one by 18.
     assert (np.max(errors, 0) < (0.012, 0.03)).all() and (np.median(errors, 0) < (0.002, 0.005)).all()
     # 5.3 were right; the covariance stands for errors that these images do not have. Of 40 seeds: 0.04 to 1.2, one 6.4.
-    assert np.median(distances) < 1.3
+    assert 0.5 < np.mean(distances) < 2.5 and np.median(distances) < 1.3
     assert np.sqrt(np.trace(estimate.covariance[:3, :3])) < 0.004  # metres; measured: 0.003
     assert np.exp(estimate.log_weight).sum() == pytest.approx(1, abs=1e-3)
     gone = frame(8, poses[8], objects=False)

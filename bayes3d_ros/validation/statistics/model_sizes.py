@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays, pack_voxels
+from bayes3d_ros.objects.library_arrays import LibraryArrays, library_arrays
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.store import save_model
 
@@ -24,7 +24,8 @@ def model_sizes(library: Library) -> ModelSizes:
     with tempfile.TemporaryDirectory(prefix="bayes3d-model-sizes-") as folder:
         files = tuple(save_model(model, Path(folder)).stat().st_size for model in library.models)
     arrays = library_arrays(library)
-    words = sum(part.size for model in library.models for part in pack_voxels(model))
+    # A grid for each octant of directions, and two planes for every edge.
+    words = sum(8 * model.occupancy.size + 2 * int(model.at_edge.sum()) for model in library.models)
     return ModelSizes(files, _own_bytes(arrays, words), sum(array.nbytes for array in arrays))
 
 
