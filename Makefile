@@ -2,7 +2,7 @@
 # make demo    parse a bundled bag through real ROS 2 nodes; results in out/demo
 # make demo-learn  learn three objects from bags of views, then parse a scene with them; results in out/demo-learn
 # make demo-unknown  meet an object that no library holds, learn it from two views, find it; results in out/demo-unknown
-# make paper   run all that the Bayes3D paper shows, for hours; results in out/paper, pages in docs/validation;  QUICK=--quick  a short form
+# make paper   run all that the Bayes3D paper shows, for hours; results in out/paper, pages in docs/validation;  QUICK=--quick  a short form, pages in out/paper-quick/pages
 # make test    all tests, two files at a time;  make test PYTEST_ARGS="test/geometry -x"  some of them
 # make lint    ruff and mypy
 # make build   build the package into install/ with colcon, for ros2 run and ros2 launch
@@ -15,8 +15,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT := out/demo
-PAPER_OUT := out/paper
 QUICK :=
+PAPER_OUT := out/paper$(if $(QUICK),-quick)
+PAPER_PAGES := $(if $(QUICK),$(PAPER_OUT)/pages,docs/validation)
 PYTEST_ARGS :=
 WORKERS := 2
 COLCON_TESTS :=
@@ -63,7 +64,7 @@ demo-unknown: setup
 PAPER := mug-pose object-type noise-ablation real-scenes camera-tracking
 paper: setup
 	for name in $(PAPER); do $(BIN)/bayes3d evaluate $$name $(QUICK) --out $(PAPER_OUT) || exit; done
-	$(BIN)/bayes3d report $(PAPER_OUT) --out docs/validation
+	$(BIN)/bayes3d report $(PAPER_OUT) --out $(PAPER_PAGES)
 
 # A worker that crashes ends the run: pytest-xdist 3.8 can wait forever for a worker that replaces it (its issue 784).
 test: setup

@@ -25,10 +25,13 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
     added. In folders, files of other programs are passed over, and unfinished experiments are named on stderr; a file
     that you name must be a finished experiment.
 
+    overview.md lists all experiments: what each asks, which limits were missed, and at which commit.
+
     If any of them answers a claim of the Bayes3D paper, paper.md holds all of its claims against the reports that are
     given; claims of other experiments are "not run".
     """
     from bayes3d_ros.validation.experiments import load, wanted
+    from bayes3d_ros.validation.overview_page import OVERVIEW_PAGE, overview_page
     from bayes3d_ros.validation.paper_page import PAPER_PAGE, answers_the_paper, paper_page
     from bayes3d_ros.validation.report import RESULTS, Report, ReportError, page, read_report, shown_pictures
 
@@ -55,6 +58,7 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         copies |= {file.parent / picture: out / RESULTS / picture for picture in pictures}
     if not pages:
         raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
+    pages.append((out / OVERVIEW_PAGE, overview_page(contents)))
     if answers_the_paper(contents):
         pages.append((out / PAPER_PAGE, paper_page(contents)))
     (out / RESULTS).mkdir(parents=True, exist_ok=True)

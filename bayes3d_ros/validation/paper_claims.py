@@ -107,15 +107,17 @@ def memory(needed: float, loss: str, summary: Summary) -> Ours | None:
 
 def noise_priors(summary: Summary) -> Ours | None:
     """In high noise, whether inferring the noise classifies more images right than assuming low noise."""
-    told, better = [], []
+    told, unsure = [], []
     for level in NOISY:
         inferred = summary.get(f"{level}: inferred")
         for prior in LOW_NOISE:
             clamped = summary.get(f"{level}: {prior}")
             if inferred and clamped:
                 told.append(f"{level} noise {inferred['right']:.0%} against {clamped['right']:.0%} ({prior})")
-                better.append(clamped["p_inferred_better"] < SIGNIFICANT)
-    return Ours(f"right, inferred against clamped: {', '.join(told)}", all(better)) if told else None
+                if (p := clamped["p_inferred_better"]) >= SIGNIFICANT:
+                    unsure.append(f"{level} noise, {prior}: p = {p:.2g}")
+    words = f"right, inferred against clamped: {', '.join(told)}"
+    return Ours(words, not unsure, f"not significant: {'; '.join(unsure)}") if told else None
 
 
 def scenes_right(models: str, summary: Summary) -> Ours | None:

@@ -96,6 +96,13 @@ def measured_at(report: Report) -> str:
     return "; then ".join(f"{_commit(run.get('commit'))}, {_date(run.get('started'))}" for run in runs)
 
 
+def commits(report: Report) -> str:
+    """The commits at which it was measured, each once, and the first date."""
+    runs = report.get("runs") or [{}]
+    at = dict.fromkeys(_commit(run.get("commit")) for run in runs)
+    return f"{', '.join(at)}, {_date(runs[0].get('started')).split(' ')[0]}"
+
+
 def _commit(commit: str | None) -> str:
     if not commit:
         return "not recorded"

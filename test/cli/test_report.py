@@ -50,7 +50,8 @@ def table(page: str) -> dict[str, list[str]]:
 def test_a_page_says_what_when_where_and_how_well(tmp_path: Path) -> None:
     result = run(written(tmp_path, PLANTED), "--out", tmp_path / "pages")
     assert result.exit_code == 0, result.output
-    assert result.stdout == f"{tmp_path / 'pages' / 'planted.md'}\n"
+    pages = [tmp_path / "pages" / name for name in ("planted.md", "overview.md")]
+    assert result.stdout == "".join(f"{page}\n" for page in pages)
     page = (tmp_path / "pages" / "planted.md").read_text()
     assert page.startswith("# planted\n")
     assert "Does the search reach the true mode?" in page and "bayes3d evaluate planted --quick --out DIR" in page
@@ -118,7 +119,8 @@ def test_folders_hold_other_files_too(tmp_path: Path) -> None:
     written(tmp_path, {"machine": {}, "rows": []}, "bench.json")
     (tmp_path / "damaged.json").write_text("{")
     result = run(tmp_path, "--out", tmp_path)
-    assert result.exit_code == 0 and sorted(path.name for path in tmp_path.glob("*.md")) == ["planted.md"]
+    assert result.exit_code == 0
+    assert sorted(path.name for path in tmp_path.glob("*.md")) == ["overview.md", "planted.md"]
     assert result.stderr.splitlines() == [
         f"no page: {tmp_path / 'dial.json'}: unfinished (3 of 60 steps): the same `bayes3d evaluate` goes on with it"
     ]
@@ -157,3 +159,16 @@ def test_every_experiment_says_what_it_measures(name: str) -> None:
     module = load(name)
     assert len((module.__doc__ or "").split()) > 8
     assert all(isinstance(what, str) for what in wanted(module).values())
+
+
+def test_the_overview_lists_every_experiment_and_what_was_missed(tmp_path: Path) -> None:
+    missed = {"summary": {"scenes": 2, "not_met": ["reached", "certain_and_wrong"]}}
+    assert run(written(tmp_path, PLANTED | missed), "--out", tmp_path / "pages").exit_code == 0
+    rows = table((tmp_path / "pages" / "overview.md").read_text())
+    assert rows["[planted](planted.md)"] == [
+        "Does the search reach the true mode?",
+        "missed: reached, certain_and_wrong",
+        "`aaaaaaaaaaaa`, `bbbbbbbbbbbb-dirty` (with changes that were not committed), 2026-11-25 (quick)",
+    ]
+    others = set(EXPERIMENTS) - {"planted"}
+    assert {name for name, cells in rows.items() if cells[-1] == "not run"} == others

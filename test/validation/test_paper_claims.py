@@ -194,4 +194,4 @@ def test_the_page_has_a_row_for_every_claim(tmp_path: Path) -> None:
 
 def test_other_experiments_have_no_page_of_claims(tmp_path: Path) -> None:
     assert run(written(tmp_path, "planted", {"scenes": 2}), "--out", tmp_path / "pages").exit_code == 0
-    assert sorted(path.name for path in (tmp_path / "pages").glob("*.md")) == ["planted.md"]
+    assert sorted(path.name for path in (tmp_path / "pages").glob("*.md")) == ["overview.md", "planted.md"]

@@ -93,8 +93,9 @@ def _reliability(axis: Axes, rows: Sequence[Row], name: str) -> None:
         axis.errorbar(told.predicted, told.predicted, error, fmt="none", color=GREY, alpha=0.5, linewidth=5, zorder=1)
         axis.scatter(told.predicted, told.observed, s=26, color=colour(1), zorder=2)
         for x, y, many in zip(*told, strict=True):
-            axis.annotate(f"{many}", (x, y), (5, -9), textcoords="offset points", fontsize=7.5, color=INK)
-    axis.set(xlim=(-0.04, 1.08), ylim=(-0.04, 1.04))
+            aside, side = (-5, "right") if x > 0.9 else (5, "left")
+            axis.annotate(f"{many}", (x, y), (aside, 5), textcoords="offset points", fontsize=7.5, color=INK, ha=side)
+    axis.set(xlim=(-0.04, 1.08), ylim=(-0.04, 1.09))
     axis.set_xlabel(f"p({name})", color=INK)
     axis.set_ylabel("share that came true", color=INK)
     _open_with_small_ticks(axis)

@@ -3,6 +3,9 @@
 """How fast and how exact is camera tracking? The paper's tracking table: a camera pans around one object, and the pose
 of the first frame is given.
 
+Frames called `own` are rendered from the voxel model that the tracker has; `independent` ones are rendered from the
+mesh by MuJoCo, with sensor noise.
+
 Errors of position and orientation are those of the camera's pose in the object's frame. Frames a second count the time
 from the array of an image to its pose, with everything compiled.
 """
@@ -17,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.io.palette import INK, colour
@@ -213,7 +217,10 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_xticks(TRACKED_SIZES, [str(size) for size in TRACKED_SIZES])
-        axis.minorticks_off()
+        for side in (axis.xaxis, axis.yaxis):
+            side.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_xlabel("pixels across", color=INK)
         axis.set_title(title, loc="left", fontsize=10, color=INK)
         open_frame(axis)

@@ -3,6 +3,9 @@
 """Do credible regions hold the truth on tables of two objects, with ten types in the library, for errors from half to
 three times as large as the settings are for? Where each object stands, and where they stand relative to each other.
 
+`range`: towards the camera; `across`: across the line of sight; `position`: both together; `apart`: position of the
+second object relative to the first, `apart_x`, `apart_y` and `apart_yaw` its parts.
+
 The generator's errors have other forms than the likelihood's (`validation/simulate/shared_error_frames.py`)."""
 
 from collections.abc import Iterator, Sequence
@@ -187,24 +190,29 @@ def _met(value: Row, limits: tuple[float, float]) -> bool:
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write coverage-tables.png: coverage of 90 % regions against the errors' size."""
-    figure = Figure(figsize=(7.5, 4.6), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(11, 4.4), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    axis.axhspan(*LIMITS[1.0], color=GREY, alpha=0.2, linewidth=0, label="wanted up to x 2")
-    axis.axhline(LIMITS[3.0][0], color=GREY, linewidth=1, linestyle=":", label="wanted at x 3")
     told = summary(rows)
+    panels = figure.subplots(1, 2, sharey=True)
+    titles = ("each object", "the second object relative to the first")
     lowest = LIMITS[3.0][0]
-    for k, name in enumerate(QUANTITIES):
-        there = [(a, told[key]["coverage_90"]) for a in AMPLITUDES if (key := f"x {a:g}: {name}") in told]
-        style = "--" if name in RELATIVE else "-"
-        lowest = min([lowest, *(share for _, share in there)])
-        axis.plot(
-            [a for a, _ in there], [share for _, share in there], style, marker="o", color=colour(k + 1), label=name
-        )
-    axis.set(ylim=(max(0.0, lowest - 0.05), 1.005))
-    open_frame(axis)
-    label_plot(axis, "size of the errors, of those that the settings are for", "truth within the 90 % region", "")
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside right upper", fontsize=8, frameon=False)
+    for axis, names, title in zip(panels, (OWN, RELATIVE), titles, strict=True):
+        for amplitude, (low, high) in LIMITS.items():
+            wanted = "wanted" if amplitude == AMPLITUDES[0] else None
+            axis.bar(amplitude, high - low, 0.36, low, color=GREY, alpha=0.2, linewidth=0, label=wanted)
+        for k, name in enumerate(names):
+            there = [(a, told[key]["coverage_90"]) for a in AMPLITUDES if (key := f"x {a:g}: {name}") in told]
+            lowest = min([lowest, *(share for _, share in there)])
+            aside = 0.04 * (k - (len(names) - 1) / 2)  # so that equal shares do not hide each other
+            axis.plot(
+                [a + aside for a, _ in there], [share for _, share in there], "o-", markersize=5, color=colour(k + 1),
+                label=name,
+            )  # fmt: skip
+        open_frame(axis)
+        axis.set_xticks(AMPLITUDES, [f"x {amplitude:g}" for amplitude in AMPLITUDES])
+        label_plot(axis, "shared errors, times those of the settings", "share of truths in 90 % regions", title)
+        axis.legend(fontsize=8, frameon=False, loc="lower left", ncols=2)
+    panels[0].set(ylim=(max(0.0, lowest - 0.12), 1.005))
     path = folder / "coverage-tables.png"
     figure.savefig(path, dpi=110)
     return [path]

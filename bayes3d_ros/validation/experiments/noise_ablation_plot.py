@@ -27,7 +27,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 def _confusion(rows: Sequence[Row], levels: list[str], priors: list[str], folder: Path) -> list[Path]:
     """A row of matrices a level, a column a prior: p(type), a mean over seeds, given the object of the row."""
-    figure = Figure(figsize=(1.75 * len(priors) + 0.7, 1.9 * len(levels) + 0.3), layout="constrained")
+    figure = Figure(figsize=(1.75 * len(priors) + 1.2, 1.9 * len(levels) + 0.3), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(levels), len(priors), squeeze=False)
     types = rows[0]["types"]
@@ -37,11 +37,13 @@ def _confusion(rows: Sequence[Row], levels: list[str], priors: list[str], folder
             image = axis.imshow(_matrix(own, types), vmin=0, vmax=1, cmap="Greys", interpolation="nearest")
             axis.set(xticks=[], yticks=[])
             right = np.mean([row["right"] for row in own])
-            axis.set_xlabel(f"{right:.0%} right", fontsize=8, color=INK)
+            axis.set_xlabel(f"inferred type; {right:.0%} right", fontsize=8, color=INK)
             if level == levels[0]:
                 title = prior if prior == priors[0] else f"clamped\n{prior}"
                 axis.set_title(title, fontsize=9, color=INK)
-        line[0].set_ylabel(f"{level} noise\nobject {1} .. {len(types)}", fontsize=8, color=INK)
+        line[0].set_ylabel(f"{level} noise\ntrue object", fontsize=8, color=INK)
+        line[0].set_yticks(range(len(types)), [name.split("_", 1)[-1] for name in types], fontsize=4)
+        line[0].tick_params(length=0, pad=1)
     bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.01)
     bar.set_label("p(type | image)", fontsize=8, color=INK)
     bar.ax.tick_params(labelsize=7)

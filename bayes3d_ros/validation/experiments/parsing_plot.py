@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The picture of the parsing experiment: error against visibility, true against stated error, every recording."""
+"""The picture of the parsing experiment: errors by type, true against stated errors, every recording."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,11 +25,11 @@ FAILED = "#B22222"
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write parsing.png."""
-    figure = Figure(figsize=(15, 5.2), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(16, 5.2), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    accuracy, honesty, table = figure.subplots(1, 3, width_ratios=(1.1, 1, 1.35))
+    accuracy, honesty, table = figure.subplots(1, 3, width_ratios=(1.05, 1, 1.35))
     objects = [row for row in rows if row["what"] == "object" and row["library"] == 10]
-    types = sorted({row["type"] for row in objects})
+    types = sorted({row["type"] for row in objects if row["visible_fraction"] is not None})
     _accuracy(accuracy, objects, types)
     _honesty(honesty, [row for row in objects if row["position_error"] is not None], types)
     _recordings(table, rows)
@@ -39,27 +39,27 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def _accuracy(axis: Axes, objects: list[Row], types: list[str]) -> None:
+    """A column a type; hollow: less than half visible."""
     told = [row for row in objects if row["visible_fraction"] is not None]
     found = [row for row in told if row["add_s"] is not None]
     missed = [row for row in told if not row["found"]]
-    top = max([1.15 * LIMIT_MM, *(1.15e3 * row["add_s"] for row in found)])
-    axis.axhspan(LIMIT_MM, top * 1.1, 0.5 / 1.05, 1, color=FAILED, alpha=0.07, linewidth=0)
-    axis.axhline(LIMIT_MM, color=FAILED, linewidth=1)
-    axis.text(0.02, LIMIT_MM, "1 cm", color=FAILED, fontsize=9, va="bottom")
+    top = 1.35 * max([1.0, *(1e3 * row["add_s"] for row in found)])
     for k, name in enumerate(types):
-        aside = 0.012 * (k - (len(types) - 1) / 2)  # most objects are wholly visible: types side by side
         for real in (False, True):
             own = [row for row in found if row["type"] == name and row["real"] == real]
-            x, y = [row["visible_fraction"] + aside for row in own], [1e3 * row["add_s"] for row in own]
-            if own:
-                axis.scatter(x, y, label=name + " (real)" * real, clip_on=False, **_dots(k, real))
-    if missed:
-        x, y = [row["visible_fraction"] for row in missed], [top] * len(missed)
-        axis.scatter(x, y, color=FAILED, marker="x", s=50, label="not found")
-    axis.set(xlim=(0, 1.05), ylim=(0, top * 1.1))
-    _label_over_grid(axis, "visible fraction (types side by side)", "ADD-S, mm", "How far off, by how much is visible")
-    if found or missed:
-        axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.8))
+            for j, row in enumerate(own):
+                aside = 0.5 * ((j + 0.5) / len(own) - 0.5)  # so that equal errors do not hide each other
+                seen = row["visible_fraction"] >= 0.5
+                axis.scatter(k + aside, 1e3 * row["add_s"], **_dots(k, real) | ({} if seen else {"color": "white"}))
+    for row in missed:
+        axis.scatter(types.index(row["type"]), 0.97 * top, color=FAILED, marker="x", s=50)
+    words = f"star: real; hollow: less than half visible;\ncross: not found; wanted: at most {LIMIT_MM:g} mm"
+    axis.text(0.02, 0.98, words, transform=axis.transAxes, fontsize=8, color=GREY, va="top")
+    axis.set(xlim=(-0.6, len(types) - 0.4), ylim=(0, top))
+    axis.set_xticks(range(len(types)), [name.split("_", 1)[-1].replace("_", "\n") for name in types])
+    if top > LIMIT_MM:
+        axis.axhline(LIMIT_MM, color=FAILED, linewidth=1)
+    _label_over_grid(axis, "", "ADD-S, mm", "How far off, in the order of the frames")
 
 
 def _honesty(axis: Axes, found: list[Row], types: list[str]) -> None:
@@ -72,13 +72,19 @@ def _honesty(axis: Axes, found: list[Row], types: list[str]) -> None:
     axis.plot(ends, ends, color=GREY, linewidth=1)
     words: dict[str, Any] = {"color": GREY, "fontsize": 8, "rotation": 45, "ha": "right", "va": "top"}
     axis.text(0.8 * ends[1], 0.6 * ends[1], "as far as stated", **words)
+    axis.text(0.02, 0.98, "above the line: farther off than stated", transform=axis.transAxes, fontsize=8, color=GREY,
+              va="top")  # fmt: skip
     for k, name in enumerate(types):
         for real in (False, True):
             own = [i for i, row in enumerate(found) if row["type"] == name and row["real"] == real]
-            axis.scatter(np.clip(sigma[own], 1e-3, None), np.clip(error[own], 1e-3, None), **_dots(k, real))
+            x, y = np.clip(sigma[own], 1e-3, None), np.clip(error[own], 1e-3, None)
+            if own:
+                axis.scatter(x, y, label=name + " (real)" * real, **_dots(k, real))
     axis.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal")
     for side in (axis.xaxis, axis.yaxis):
         side.set_major_formatter(lambda value, _: f"{value:g}")
+    if found:
+        axis.legend(fontsize=7, frameon=False, loc="lower right")
     covered = f"{sum(row['covered'] for row in found)} of {len(found)} within the 95 % region"
     _label_over_grid(axis, "stated sigma of the position, mm", "true error of the position, mm", f"How sure: {covered}")
 

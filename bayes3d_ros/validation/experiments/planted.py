@@ -173,17 +173,26 @@ def _share(flags: Sequence[bool]) -> float | None:
 
 def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write planted.png: evidence missed, and the probability of the true type, against what is seen."""
-    figure = Figure(figsize=(10, 3.6), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(11, 3.8), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     parsed = [row for row in rows if row["error"] is None]
-    seen = [100 * row["share"] for row in parsed]
     missed, true = figure.subplots(1, 2)
-    missed.plot(seen, [row["planted"] - row["log_evidence"] for row in parsed], "o", color="#0072B2", alpha=0.6)
+    enough = {
+        f"compared: {ENOUGH:g} or more effective draws": [row for row in parsed if row["planted_ess"] >= ENOUGH],
+        "fewer draws: not compared": [row for row in parsed if row["planted_ess"] < ENOUGH],
+    }
+    for (words, own), face in zip(enough.items(), ("#0072B2", "none"), strict=True):
+        x, y = [100 * row["share"] for row in own], [row["planted"] - row["log_evidence"] for row in own]
+        edge = "#0072B2" if face != "none" else "#999999"
+        missed.scatter(x, y, s=30, facecolor=face, edgecolor=edge, alpha=0.8, label=words)
     missed.axhline(MISSED_NATS, color=INK, linestyle="--", linewidth=1)
     missed.set_yscale("symlog", linthresh=1)
+    missed.legend(fontsize=8, frameon=False, loc="lower right")
+    seen = [100 * row["share"] for row in parsed]
     true.plot(seen, [row["p_true"] for row in parsed], "o", color="#D55E00", alpha=0.6)
-    label_plot(missed, "columns in sight, %", "nats", "evidence about the truth less the sampler's (dashed: limit)")
-    label_plot(true, "columns in sight, %", "p", "probability of the true type")
+    missing = "evidence at the true pose, less the sampler's (dashed: limit)"
+    label_plot(missed, "columns in sight, %", "nats", missing, size=9)
+    label_plot(true, "columns in sight, %", "p(true type)", "probability of the true type", size=9)
     for axis in (missed, true):
         open_frame(axis)
     path = folder / "planted.png"

@@ -204,4 +204,4 @@ def _against_shipped(axis: Axes, rows: Sequence[Row], kind: str, name: str, scal
             axis.plot([low, high], [low, high], color=GREY, linewidth=1)
     open_frame(axis)
     label_plot(axis, f"at score_width {SHIPPED}", "at the other width", title)
-    axis.legend(fontsize=8, frameon=False)
+    axis.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=2)

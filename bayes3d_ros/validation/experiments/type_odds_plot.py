@@ -40,7 +40,7 @@ def plot(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def _reliability(axis: Axes, p_true: np.ndarray, amplitude: float) -> None:
-    """Share of right answers against their probability, with two binomial errors."""
+    """Share of right answers against their probability (that of the more probable type), with two binomial errors."""
     said = np.maximum(p_true, 1 - p_true)
     which = np.clip(np.digitize(said, BINS) - 1, 0, len(BINS) - 2)
     axis.plot([0.5, 1], [0.5, 1], color=GREY, linewidth=1)
@@ -49,11 +49,12 @@ def _reliability(axis: Axes, p_true: np.ndarray, amplitude: float) -> None:
         if own.any():
             right, mean = float((p_true[own] > 0.5).mean()), float(said[own].mean())
             error = 2 * np.sqrt(mean * (1 - mean) / own.sum())
-            axis.errorbar(mean, right, yerr=error, fmt="o", color="#0072B2", markersize=4, linewidth=1)
+            bars = [[min(error, right)], [min(error, 1 - right)]]
+            axis.errorbar(mean, right, yerr=bars, fmt="o", color="#0072B2", markersize=4, linewidth=1)
             axis.annotate(f"{own.sum()}", (mean, right), xytext=(-5, 3), textcoords="offset points", fontsize=7,
                           ha="right", color=INK)  # fmt: skip
     axis.set(xlim=(0.48, 1.02), ylim=(-0.02, 1.04))
-    label_plot(axis, "p of the more probable type (beside: answers)", "share right",
+    label_plot(axis, "stated p (numbers: answers)", "share right",
                f"errors x {amplitude:g}, {len(p_true)} frames")  # fmt: skip
     open_frame(axis)
 
@@ -68,7 +69,7 @@ def _losses(axis: Axes, parsed: Sequence[Row], amplitudes: Sequence[float]) -> N
         axis.plot(*zip(*points, strict=True), "o-", color=colour(k + 1), label=pair)
     axis.axhline(np.log(2), color=INK, linestyle="--", linewidth=1)
     axis.set_ylim(0, _ROOM * axis.get_ylim()[1])
-    label_plot(axis, "amplitude of shared errors", "nats", "log loss (dashed: a coin's)")
+    label_plot(axis, "shared errors, times those of the settings", "nats", "log loss (dashed: a coin's)")
     open_frame(axis)
     if parsed:
         axis.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
