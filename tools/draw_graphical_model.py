@@ -29,15 +29,15 @@ class Node(NamedTuple):
 
 
 NODES = {
-    "n": Node(1.3, 5.5, "$n$", "number of objects"),
-    "placement": Node(4.1, 5.5, r"$o_i, c_i, \phi_i$", "type, contact face; x, y, yaw"),
+    "n": Node(1.0, 5.5, "$n$", "number of objects"),
+    "placement": Node(5.95, 5.5, r"$o_i, c_i, \phi_i$", "type, contact face; x, y, yaw"),
     "table": Node(8.2, 5.5, "$T$", "table: tilts, height"),
-    "scale": Node(1.3, 3.5, "$s$", "scale of objects' errors"),
-    "shared": Node(3.3, 3.5, "$a_i$", "offset and lean"),
-    "cell": Node(5.2, 3.5, "$w_{iB}, b_{iB}$", "wave, error of a cell"),
+    "scale": Node(2.55, 3.6, "$s_i$", "scale of errors"),
+    "shared": Node(3.95, 3.6, "$a_i$", "offset and lean"),
+    "cell": Node(5.45, 3.6, "$w_{iB}, b_{iB}$", "wave, error of a cell"),
     "tau": Node(12.3, 3.5, r"$\tau$", "s.d. of the table's errors"),
     "ground": Node(10.0, 3.5, "$b_{0B}$", "error of a cell"),
-    "depth": Node(8.2, 1.2, "$d_p$", "rendered depth and its errors", "computed"),
+    "depth": Node(8.2, 1.2, "$m_p$", "$d_p$ plus shared errors", "computed"),
     "image": Node(10.6, 1.2, "$z_p$", "measured depth", "observed"),
     "noise": Node(13.2, 1.2, r"$\sigma, p_{out}$", "noise, outliers"),
 }
@@ -46,10 +46,10 @@ ARROWS = (
     *(("table", "depth"), ("shared", "depth"), ("cell", "depth"), ("ground", "depth"), ("depth", "image")),
     ("noise", "image"),
 )
-BENT = {("scale", "cell"): -0.28}  # around what lies between
+BENT = {("scale", "cell"): -0.45}  # around what lies between
 PLATES = (  # left, bottom, width, height, words: at the upper left or the lower right
-    (2.35, 2.4, 4.2, 3.9, "objects $i = 1 .. n$", "left"),
-    (4.35, 2.6, 1.75, 1.75, "cells $B$", "left"),
+    (1.9, 2.4, 5.2, 3.9, "objects $i = 1 .. n$", "left"),
+    (4.65, 2.65, 1.6, 1.8, "cells $B$", "left"),
     (9.15, 2.6, 1.75, 1.75, "cells $B$", "left"),
     (6.9, 0.1, 5.0, 2.1, "pixels $p$ whose return is kept", "right"),
 )
@@ -88,7 +88,7 @@ def main() -> None:
     figure = Figure(figsize=(10.5, 4.8), facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.2, 14.2), ylim=(0.0, 6.4), aspect="equal")
+    axes.set(xlim=(0.0, 14.2), ylim=(0.0, 6.4), aspect="equal")
     axes.axis("off")
     draw(axes)
     figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else None)
