@@ -65,9 +65,13 @@ class ParseService:
     def _respond(self) -> None:
         """Let the calls go on that have their answer. rclpy resumes them before it waits for anything else, as this
         runs on the executor."""
+        waiting = []
         for request, answered in self._calls:
-            if request.answer is not None:
-                answered.set_result(request.answer)
-        self._calls = [call for call in self._calls if call[0].answer is None]
+            answer = request.answer  # read once: the worker may settle it meanwhile
+            if answer is None:
+                waiting.append((request, answered))
+            else:
+                answered.set_result(answer)
+        self._calls = waiting
         if not self._calls:
             self._looking.cancel()

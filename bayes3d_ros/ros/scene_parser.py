@@ -71,6 +71,7 @@ class SceneParserNode(Node):
         self._frames: OutputFrames | None = None  # there while inputs are
         self._transforms: ObjectTransforms | None = None  # from the first publish_tf on
         self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
+        self._opened: tuple[object, ...] = ()  # values of parameters that inputs were opened for
         self._ids = IdMemory()  # the worker's alone
         self._outputs = ScenePublishers(self)
         refuse_wrong_transitions(self)
@@ -167,9 +168,14 @@ class SceneParserNode(Node):
 
     def _open_inputs(self) -> None:
         use_pose = {"depth": "no", "auto": "yes", "pose": "required"}[self._parts.settings.read(ParserSettings).table]
+        self._opened = self._input_values()
         self._open_frames()
         self._parts.listen(self._on_image, use_pose)
         self._parts.health.begin()
+
+    def _input_values(self) -> tuple[object, ...]:
+        """The parameters for which inputs are opened anew while the node is active."""
+        return tuple(self.get_parameter(name).value for name in (*INPUT_PARAMETERS, "table"))
 
     def _close_inputs(self) -> None:
         self._parts.close_inputs()
@@ -210,11 +216,11 @@ class SceneParserNode(Node):
         if "mode" in names:
             self._parts.health.begin()
         if self._preparation.begun and names & _COMPILED:
-            if (wrong := self._preparation.begin()) and self._ready is not None:
+            if (wrong := self._preparation.adapt()) and self._ready is not None:
                 self._parts.refuse(f"{wrong}; the parser goes on with the settings that it had")
         elif self._preparation.begun and names & {*PER_FRAME}:
             self._in_use.adjust(self._parts.settings.in_use(ParserSettings))
-        if self._parts.inputs is not None and names & {*INPUT_PARAMETERS, "table"}:
+        if self._parts.inputs is not None and self._input_values() != self._opened:
             self._parts.worker.forget()
             self._open_inputs()
         elif self._parts.inputs is not None and names & {*OUTPUT_FRAME_PARAMETERS}:

@@ -18,6 +18,8 @@ from std_srvs.srv import Trigger
 from test_scene_parser import depth_frame, state
 
 from bayes3d_ros.ros.from_messages import stamp_to_ns
+from bayes3d_ros.ros.parse_requests import ParseAnswer
+from bayes3d_ros.ros.parse_service import ParseService
 
 PARSE = "/scene_parser/parse"
 FOUND = r"1 object: brick_\d+ \(p 0\.75\); image of stamp (\d+)\.(\d{9})"
@@ -189,3 +191,22 @@ def test_a_client_that_goes_away_does_not_hurt_the_node(waiting: Robot) -> None:
 def test_a_node_ends_cleanly_while_a_call_waits(waiting: Robot) -> None:
     waiting.ask()
     waiting.wait_for_calls(1)
+
+
+def test_an_answer_that_comes_while_calls_are_looked_at_is_not_lost(ros) -> None:
+    """The worker settles a request between two looks of the executor at it."""
+    service = ParseService(ros.node, lambda: 10.0, lambda: "", lambda: "")
+
+    class Settled:
+        looks = 0
+
+        @property
+        def answer(self) -> ParseAnswer | None:
+            self.looks += 1
+            return ParseAnswer(True, "found") if self.looks > 1 else None
+
+    call = Settled(), Future()
+    service._calls = [call]
+    service._respond()
+    service._respond()
+    assert call[1].done() and call[1].result() == ParseAnswer(True, "found")

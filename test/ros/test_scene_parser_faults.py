@@ -311,7 +311,7 @@ def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, librar
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     names = ros.listen(String, f"{name}/library")
     folder = tmp_path / "library"
-    ros.start_parser(folder, namespace="/late")
+    process = ros.start_parser(folder, namespace="/late")
     mine = f"{name}: scene parsing"
     ros.wait_for_diagnosis(diagnostics, "no such library folder", mine)
     reload = f"{name}/reload_library"
@@ -337,11 +337,13 @@ def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, librar
         assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == label
     ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
 
-    # A setting for which a parser has to be made, when there is no library any more.
+    # A setting for which a parser has to be made, when there is no folder any more: the library is in memory.
     shutil.move(folder, tmp_path / "away")
+    ready = process.output().count("parser ready")
     request = SetParameters.Request(parameters=[Parameter("count_ratio", value=0.2).to_parameter_msg()])
     assert ros.call(SetParameters, f"{name}/set_parameters", request).results[0].successful
-    ros.wait_for_diagnosis(diagnostics, "the parser goes on with the settings that it had", mine)
+    ros.wait_for(lambda: process.output().count("parser ready") == ready + 1, "a parser of the new setting")
+    assert "no such library folder" in ros.call(Trigger, reload, Trigger.Request()).message
     shutil.move(tmp_path / "away", folder)
     assert ros.call(Trigger, reload, Trigger.Request()).success
     ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
