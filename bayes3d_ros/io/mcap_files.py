@@ -18,6 +18,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from bayes3d_ros.lists import hint
 
+_TRANSIENT_LOCAL = 1  # rmw_qos_durability_policy_t
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _REMEDY = "ros2 bag convert makes one"
 _SQLITE = f"expected an MCAP file, it is of storage sqlite3 ({_REMEDY})"
@@ -32,21 +33,24 @@ class BagDamage(BagError):
 
 
 class RawMessage(NamedTuple):
-    """A recorded message: `t_ns` is when it was recorded, `data` its CDR bytes."""
+    """A recorded message: `t_ns` is when it was recorded, `data` its CDR bytes; `latched`: see `Topic`."""
 
     topic: str
     msgtype: str
     t_ns: int
     data: bytes
+    latched: bool = False
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A recorded topic with `count` messages."""
+    """A recorded topic with `count` messages. `latched`: its publisher was transient_local, so that whoever subscribed
+    late got the last message."""
 
     name: str
     msgtype: str
     count: int
+    latched: bool = False
 
 
 def raw_messages(bag: Path) -> Iterator[RawMessage]:
@@ -70,7 +74,7 @@ def topics(bag: Path) -> dict[str, Topic]:
     try:
         for message in raw_messages(bag):
             count = found[message.topic].count if message.topic in found else 0
-            found[message.topic] = Topic(message.topic, message.msgtype, count + 1)
+            found[message.topic] = Topic(message.topic, message.msgtype, count + 1, message.latched)
     except BagDamage as error:
         if not found:
             raise BagError(str(error)) from None
@@ -126,6 +130,7 @@ def _messages(file: Path) -> Iterator[RawMessage]:
             raise BagError(f"{file}: expected an MCAP file, it is empty (0 bytes)")
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
+        latched: dict[int, bool] = {}
         count = 0
         records = StreamReader(stream, emit_chunks=True).records
         while True:
@@ -149,6 +154,7 @@ def _messages(file: Path) -> Iterator[RawMessage]:
                     schemas[definition.id] = definition
                 elif isinstance(definition, Channel):
                     channels[definition.id] = definition
+                    latched[definition.id] = _is_latched(definition)
             for message in sorted((r for r in inside if isinstance(r, Message)), key=lambda m: m.log_time):
                 channel = channels.get(message.channel_id)
                 if channel is None or channel.schema_id not in schemas:
@@ -158,7 +164,23 @@ def _messages(file: Path) -> Iterator[RawMessage]:
                         f"{file}: {channel.topic}: expected messages in cdr, got {channel.message_encoding!r}"
                     )
                 count += 1
-                yield RawMessage(channel.topic, schemas[channel.schema_id].name, message.log_time, message.data)
+                yield RawMessage(
+                    channel.topic,
+                    schemas[channel.schema_id].name,
+                    message.log_time,
+                    message.data,
+                    latched[message.channel_id],
+                )
+
+
+def _is_latched(channel: Channel) -> bool:
+    """Whether a publisher that was recorded offered transient_local, by the QoS profiles that rosbag2 writes: as a word
+    since Jazzy, before that as rmw's number."""
+    try:
+        profiles = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
+        return any(profile["durability"] in ("transient_local", _TRANSIENT_LOCAL) for profile in profiles)
+    except (yaml.YAMLError, TypeError, KeyError):
+        return False  # written by others
 
 
 def _damage(file: Path, count: int) -> BagDamage:

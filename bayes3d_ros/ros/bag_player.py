@@ -32,7 +32,8 @@ SETTLE_SECONDS = 0.5  # from a node's first subscription to the last that it mak
 
 
 class BagPlayer(Node):
-    """Publishes the recorded CDR bytes, reliable, at the times they were recorded.
+    """Publishes the recorded CDR bytes, reliable, at the times they were recorded; latched where the recorded publisher
+    was (transient_local), and /tf_static always.
 
     A player in a namespace (-r __ns:=/left) publishes in it: recorded /depth/image_rect as /left/depth/image_rect.
     """
@@ -51,7 +52,7 @@ class BagPlayer(Node):
             except ImportError:
                 self.get_logger().warning(f"{name} is left out: {topic.msgtype} is not installed")
                 continue
-            latched = name.split("/")[-1] == "tf_static"
+            latched = topic.latched or name.split("/")[-1] == "tf_static"
             qos = QoSProfile(
                 depth=100,
                 reliability=ReliabilityPolicy.RELIABLE,

@@ -16,9 +16,9 @@ from bayes3d_ros.ros.input_topics import POSE_INPUT
 from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
-from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
+from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, plain_frame, tf_poses
 
-_HISTORY = 2.0  # seconds of poses that are kept beyond `patience`
+_HISTORY = 10.0  # seconds of poses that are kept beyond `patience`: as long as tf2 keeps transforms
 
 
 class CameraPose(NamedTuple):
@@ -45,8 +45,8 @@ class CameraPoseSource:
     publisher, of /tf_static, or the parameter's, which counts only where neither the topic nor tf is in use.
 
     `required`: an image waits for its pose even if nobody seems to send one. So it does in the first `patience`
-    seconds, when who publishes is hardly known. `on_pose` is called after every pose. `static`: a pose that was heard
-    before, and holds until another one comes.
+    seconds after the first image, when who publishes is hardly known. `on_pose` is called after every pose. `static`: a
+    pose that was heard before, and holds until another one comes.
     """
 
     def __init__(
@@ -61,7 +61,8 @@ class CameraPoseSource:
         self._fixed = matrix_from_values(list(settings.camera_pose)) if settings.camera_pose else None
         self._required = required and self._fixed is None
         self._history = PoseHistory(settings.pose_max_gap, settings.patience + _HISTORY, static)
-        self._known_from = time.monotonic() + settings.patience
+        self._patience = settings.patience
+        self._known_from: float | None = None  # when who publishes is known; None before the first image
         self.refused = ""  # what is wrong with the newest message on the topic
         self._topic = AutoSubscription(
             node,
@@ -106,8 +107,14 @@ class CameraPoseSource:
         if self._tf is not None:
             self._tf.renew()
 
+    def in_use(self, camera_frame: str) -> bool:
+        """Whether somebody publishes poses, or tf connects the camera with the table."""
+        return bool(self.publishers) or (self._tf is not None and self._tf.connects(camera_frame))
+
     def find(self, stamp_ns: int, camera_frame: str, last: bool) -> CameraPose | None:
         """The pose at a stamp; None while a better one may come, which is never so for the `last` question."""
+        if self._known_from is None:
+            self._known_from = time.monotonic() + self._patience
         pose = self._history.at(stamp_ns)
         if pose is not None:
             return CameraPose(pose, "topic")
@@ -129,7 +136,7 @@ class CameraPoseSource:
     def _on_pose(self, message: PoseStamped, latched: bool) -> None:
         """Take a pose from the topic; one that cannot be used is left out and named in `refused`."""
         frame = message.header.frame_id
-        if frame not in ("", self._table_frame):
+        if plain_frame(frame) not in ("", self._table_frame):
             self.refused = f"{self.topic}: expected frame_id {self._table_frame!r} (table_frame), got {frame!r}"
             return
         try:
@@ -143,9 +150,9 @@ class CameraPoseSource:
 
     def _awaited(self, camera_frame: str) -> bool:
         """Whether a pose for an image may still come."""
-        if self.publishers or self._required or (self._tf is not None and self._tf.connects(camera_frame)):
+        if self._required or self.in_use(camera_frame):
             return True
-        return time.monotonic() < self._known_from
+        return self._known_from is not None and time.monotonic() < self._known_from
 
     def _fallback(self, stamp_ns: int, camera_frame: str) -> CameraPose:
         """The best pose for a stamp that neither the topic nor tf knows."""
@@ -155,10 +162,9 @@ class CameraPoseSource:
         pose = None if self._tf is None else self._tf.latest(stamp_ns, camera_frame, self._tolerance)
         if pose is not None:
             return CameraPose(pose, "tf")
-        problem = self._why_none(stamp_ns, camera_frame)
-        if problem or self._fixed is None:
-            return CameraPose(None, "none", problem)
-        return CameraPose(self._fixed, "parameter")
+        if self._fixed is not None and not self.in_use(camera_frame):
+            return CameraPose(self._fixed, "parameter")  # also where a publisher of before has gone
+        return CameraPose(None, "none", self._why_none(stamp_ns, camera_frame))
 
     def _why_none(self, stamp_ns: int, camera_frame: str) -> str:
         """Why there is no pose on the topic, or in tf; empty where neither is in use."""

@@ -24,7 +24,7 @@ from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.camera_path import CameraPath
 from bayes3d_ros.ros.depth_inputs import DepthMessages
 from bayes3d_ros.ros.depth_node import InferenceParts, answer, library_in, prepare_jax
-from bayes3d_ros.ros.diagnostics import ERROR, QUIET, REPEAT
+from bayes3d_ros.ros.diagnostics import ERROR, QUIET, REPEAT, WARN
 from bayes3d_ros.ros.node_settings import CAMERA_TRACKER_SETTINGS, DEPTH_INPUT_PARAMETERS, CameraTrackerNodeSettings
 from bayes3d_ros.ros.qos import RELIABLE
 from bayes3d_ros.ros.spinning import run_node
@@ -85,6 +85,7 @@ class CameraTrackerNode(Node):
         self._has_pose = False  # whether the last frame gave one
         self._begun = 0  # trackers so far
         self._placed = 0  # which of them had its world's frame placed last: then images need no camera pose any more
+        self._unplaced = False  # whether that frame is the plane in the first image, as no camera pose was in use
         self._told = ""
         self._path = CameraPath(self._node_settings().path_length)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/camera_pose", RELIABLE)
@@ -123,7 +124,7 @@ class CameraTrackerNode(Node):
 
         def job() -> None:
             self._known, self._session = None, None
-            self._waited, self._has_pose = 0.0, False
+            self._waited, self._has_pose, self._unplaced = 0.0, False, False
             self._path.clear()
             self._parts.health.begin()
             try:
@@ -169,6 +170,8 @@ class CameraTrackerNode(Node):
             self._no_pose(f"lost: {error}" if self._known is not None else str(error))
             return
         now = time.monotonic()
+        if self._known is None:
+            self._unplaced = not session.world_told and frame.T_table_camera is None
         self._known = known
         self._waited = now - began if estimate.found_again else 0.0
         self._placed = session.begun
@@ -182,7 +185,10 @@ class CameraTrackerNode(Node):
         self._path.add(estimate, world)
         if self._trail.get_subscription_count():  # grows with every frame
             self._trail.publish(self._path.message())
-        notes = ("the camera was searched for in the whole of the last image",) if estimate.found_again else ()
+        notes = [
+            *(["the camera was searched for in the whole of the last image"] if estimate.found_again else []),
+            *([f"no camera pose: the world's frame, {world!r}, is that of the first image"] if self._unplaced else []),
+        ]
         self._parts.health.output(now - began, [estimate.ess], time.monotonic() - messages.arrived, notes=notes)
 
     def _no_pose(self, why: str) -> None:
@@ -222,6 +228,9 @@ class CameraTrackerNode(Node):
         view = self._parts.inputs.view()
         told = (ERROR, self._parts.refusal) if self._parts.refusal else self._parts.judge(view, good="tracking")
         session = self._session
+        if not self._parts.refusal and session is not None and self._unplaced and view.pose_in_use:
+            late = f"camera poses came after the first image, so the world's frame is not {session.table_frame!r}"
+            told = WARN, f"{told[1]}; {late}: call ~/reset"
         self._parts.health.backend = session.backend if session else ""
         state = "waiting" if self._known is None else "tracking" if self._has_pose else "lost"
         return self._parts.health_report("camera tracking", told, state, view)

@@ -85,6 +85,7 @@ class DepthInputs:
             self._queue.remember_info(heard.info)
         self._next_poll = 0.0
         self._pose_used = NO_POSE
+        self._frame_id: str | None = None  # of the newest image
         self._poses: CameraPoseSource | None = None
         if use_pose != "no":
             self._poses = CameraPoseSource(node, settings, use_pose == "required", self._on_pose, heard.static_pose)
@@ -131,6 +132,9 @@ class DepthInputs:
             pose_problem=self._pose_problem(),
             pose_topic="" if self._poses is None else self._poses.topic,
             pose_publishers=() if self._poses is None else self._poses.publishers,
+            pose_in_use=self._poses is not None and self._poses.in_use(self._frame_id or ""),
+            frame_id=self._frame_id,
+            distorted=self._distorted(),
             stamps_agree=self._queue.stamps_agree,
         )
 
@@ -174,6 +178,7 @@ class DepthInputs:
 
     def _on_image(self, image: DepthMessage, latched: bool) -> None:
         self._depth_at = time.monotonic()
+        self._frame_id = image.header.frame_id
         self.received += 1
         stamp_ns = stamp_to_ns(image.header.stamp)
         if self._queue.add_image(stamp_ns, image, len(image.data), self._depth_at) and self._poses is not None:
@@ -189,6 +194,11 @@ class DepthInputs:
         if self._poses is None or not self._wants_pose():
             return NO_POSE
         return self._poses.find(stamp_ns, image.header.frame_id, last)
+
+    def _distorted(self) -> bool:
+        """Whether images may need to be rectified. (Rectifiers may leave D as it was, but call their topic so.)"""
+        info = self._queue.latest_info
+        return info is not None and any(abs(d) > 0 for d in info.d) and "rect" not in self._image_topic.topic
 
     def _pose_problem(self) -> str:
         if self._poses is None:

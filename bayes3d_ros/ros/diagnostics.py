@@ -43,7 +43,9 @@ class TopicView:
 @dataclass(frozen=True)
 class InputView:
     """What a node can see of its inputs. `waiting` images are incomplete; `delivered_age` is seconds since the last
-    complete one (None: never)."""
+    complete one (None: never). `pose_in_use`: somebody publishes camera poses, or tf connects the camera and the table.
+    `frame_id`: that of the newest image (None: there was none). `distorted`: the CameraInfo has lens distortion, and
+    the topic's name does not say that images are rectified."""
 
     image: TopicView
     info: TopicView
@@ -53,6 +55,9 @@ class InputView:
     pose_problem: str = ""
     pose_topic: str = ""
     pose_publishers: tuple[str, ...] = ()
+    pose_in_use: bool = False
+    frame_id: str | None = None
+    distorted: bool = False
     stamps_agree: bool = True
 
     @property
@@ -84,6 +89,12 @@ def input_warnings(view: InputView) -> list[str]:
     told = []
     if view.pose_problem:
         told.append(f"no camera pose: {view.pose_problem}")
+    if view.frame_id == "":
+        told.append(f"images on {view.image.name} have an empty frame_id, expected the camera's optical frame")
+    if view.distorted:
+        told.append(
+            f"{view.info.name} has lens distortion (D), and {view.image.name} is taken for rectified (image_proc)"
+        )
     topics = ((view.image.name, view.image.publishers), (view.info.name, view.info.publishers))
     for name, publishers in (*topics, (view.pose_topic, view.pose_publishers)):
         if len(publishers) > 1:

@@ -8,10 +8,16 @@ from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.depth_transport import RAW, TRANSPORTS
 from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.ros.planning_scene import why_not
-from bayes3d_ros.ros.tf_poses import NO_TF, tf2_ros
+from bayes3d_ros.ros.tf_poses import NO_TF, plain_frame, tf2_ros
 from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 
 CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser
+
+
+def check_frame_name(setting: str, name: str) -> None:
+    """Raise ValueError, in one line, for a name that tf2 refuses."""
+    if name != plain_frame(name):
+        raise ValueError(f"{setting} must name a frame without a slash before it, as tf2 does, got {name!r}")
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,9 @@ class DepthInputSettings:
 
     def __post_init__(self) -> None:
         validate(self)
+        check_frame_name("table_frame", self.table_frame)
+        if not self.table_frame:
+            raise ValueError("table_frame must name a frame, got ''")
         if self.camera_pose:
             try:
                 matrix_from_values(list(self.camera_pose))
@@ -120,6 +129,7 @@ class SceneParserNodeSettings(DepthInputSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_frame_name("output_frame", self.output_frame)
         sigma = self.camera_pose_sigma
         if len(sigma) != 2 or not all(0.0 <= value <= 1.0 for value in sigma):
             raise ValueError(f"camera_pose_sigma must be two numbers in [0, 1], m and rad, got {list(sigma)}")

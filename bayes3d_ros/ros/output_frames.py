@@ -65,6 +65,13 @@ class OutputFrames:
             raise ValueError(f"output_frame {wanted!r}: {NO_TF}; expected the camera's frame, or {TABLE!r}")
         return self._through_tf(self._tf, posterior, arrived + self._settings.patience)
 
+    def unplaced(self, posterior: ScenePosterior) -> str:
+        """Why poses in the table's frame must not be taken for poses in the frame of that name which tf or another node
+        may know; empty where a camera pose placed the table, or poses are in another frame."""
+        if self._settings.output_frame not in self._table_names or not posterior.table_found:
+            return ""
+        return f"no camera pose: poses in {self.table_frame!r} (output_frame) are in a frame of this image alone"
+
     def close(self) -> None:
         """Stop listening to tf, and waiting for it."""
         self._closed.set()

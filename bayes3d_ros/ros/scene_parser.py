@@ -268,13 +268,15 @@ class SceneParserNode(Node):
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             return ParseAnswer(False, self._parts.problem(str(error), why))
         ids, self._ids = named(self._ids, told)
-        if transforms is not None:  # before messages that name the ids
+        unplaced = frames.unplaced(posterior) if ready.parser.settings.table == "auto" else ""  # else it is wanted so
+        if transforms is not None and not unplaced:  # before messages that name the ids
             transforms.send(told, ids)
         if planning is not None:
             planning.send(told, ids, ready.meshes)
         self._outputs.scene(ToldScene(told, ids, ready.parser.library, ready.markers, frames.table_frame))
         latency = time.monotonic() - messages.arrived
-        health.output(posterior.seconds, posterior.ess, latency, posterior.warnings, posterior.usable_share)
+        warnings = (*posterior.warnings, *([unplaced] if unplaced else []))
+        health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
         return ParseAnswer(True, found_words(told, ids))
 
     def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:

@@ -67,6 +67,8 @@ class AutoSubscription:
             self._volatile = self._subscribe(DurabilityPolicy.VOLATILE)
             self._node.get_logger().info(f"a publisher on {self.topic} is best effort: subscribing best effort")
         everybody = self._node.get_publishers_info_by_topic(self.topic)
+        if not everybody:
+            self.problem = ""  # whoever could not be heard has gone
         self._publishers = [p for p in everybody if p.topic_type == self._type]
         others = {p.topic_type for p in everybody} - {self._type} if not self._publishers else ()
         self.other_type = f"it has type {', '.join(sorted(others))}, expected {self._type}" if others else ""

@@ -25,6 +25,11 @@ _JUMP = 1.0  # seconds backwards, after which tf is heard anew; of real time, in
 _MEMORY = 10.0  # seconds, tf2's own default
 
 
+def plain_frame(name: str) -> str:
+    """A frame's name as tf2 has it: without the slash that names of ROS 1 begin with, which tf2 refuses."""
+    return name.removeprefix("/")
+
+
 def tf_poses(node: Node, frame: str, memory: float = _MEMORY) -> "TfPoses | None":
     """Poses in a frame; None where tf2_ros is not installed."""
     return None if tf2_ros is None else TfPoses(node, frame, memory)
@@ -103,7 +108,7 @@ class TfPoses:
             self._failure = "the clock, or the stamps of images, have just jumped back"
             return None, 0
         try:
-            found = self._buffer.lookup_transform(self._frame, source_frame, stamp)
+            found = self._buffer.lookup_transform(self._frame, plain_frame(source_frame), stamp)
         except tf2_ros.TransformException as error:
             self._failure = " ".join(str(error).split())
             if isinstance(error, tf2_ros.ExtrapolationException):

@@ -5,10 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rcl_interfaces.srv import ListParameters
+from rclpy.qos import DurabilityPolicy
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 from bayes3d_ros.io.bags import BagWriter
+from bayes3d_ros.io.message_file import MessageFile
 from bayes3d_ros.ros import from_messages
 from bayes3d_ros.ros.bag_player import main, message_class
 
@@ -91,6 +95,24 @@ def test_in_a_namespace_everything_is_played_in_it(ros, bag: Path) -> None:
     ros.wait_for(lambda: len(images) == 3, "three images")  # though nobody listens to the other topics
     topics = {name for name, _ in ros.node.get_topic_names_and_types()}
     assert "/left/depth/camera_info" in topics and "/depth/camera_info" not in topics
+    assert player.stop() == 0, player.output()
+
+
+def test_a_topic_that_was_latched_is_latched_again(ros, tmp_path: Path) -> None:
+    """A camera pose that is sent once must reach a node that starts later, and count as one that stands still."""
+    heard = ros.listen(String, "/again")
+    with MessageFile(tmp_path / "a.mcap") as file:
+        for name, latched in (("/once", True), ("/again", False)):
+            file.add_topic(name, "std_msgs/msg/String", "string data", latched=latched)
+            file.write(name, serialize_message(String(data=name)), 10**9)
+    player = ros.start("-m", "bayes3d_ros.ros.bag_player", str(tmp_path / "a.mcap"), "--loop", "--wait-for", "/test")
+    ros.wait_for(lambda: heard, "a message")
+
+    def durability(name: str) -> DurabilityPolicy:
+        (publisher,) = ros.node.get_publishers_info_by_topic(name)
+        return publisher.qos_profile.durability
+
+    assert durability("/once") == DurabilityPolicy.TRANSIENT_LOCAL and durability("/again") == DurabilityPolicy.VOLATILE
     assert player.stop() == 0, player.output()
 
 

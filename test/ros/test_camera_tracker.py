@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.srv import SetParameters
@@ -131,6 +131,17 @@ def test_a_first_frame_whose_camera_pose_is_missing_places_no_world(rig, placed)
     rig.show(2 * 10**9, 1.0)
     rig.ros.wait_for(lambda: rig.poses, "a pose in the world that the second frame places")
     assert stamp_to_ns(rig.poses[0].header.stamp) == 2 * 10**9
+
+
+def test_a_camera_pose_that_comes_after_the_world_was_placed_is_told(rig):
+    """tf that starts after the camera: poses would be told in a frame that only seems to be the table's."""
+    rig.start()
+    rig.show(10**9, 1.0)
+    rig.ros.wait_for(lambda: rig.poses, "a pose in the plane of the first image")
+    publisher = rig.ros.node.create_publisher(PoseStamped, "/camera_pose", 10)
+    late = "camera poses came after the first image, so the world's frame is not 'bench': call ~/reset"
+    assert rig.ros.wait_for_diagnosis(rig.diagnostics, late, TRACKER).status[0].level == DiagnosticStatus.WARN
+    rig.ros.node.destroy_publisher(publisher)
 
 
 def test_after_a_reset_the_next_frame_waits_for_a_camera_pose_again(rig, placed):

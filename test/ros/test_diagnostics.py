@@ -13,6 +13,7 @@ from bayes3d_ros.ros.diagnostics import (
     InputView,
     LogThrottle,
     TopicView,
+    input_warnings,
     judge,
     judge_on_request,
     why_no_input,
@@ -126,6 +127,18 @@ def test_what_is_wrong_beside_an_output_is_a_warning() -> None:
         f"parsing; no camera pose: late; 2 publishers on {DEPTH}, expected one: /driver, /player; "
         f"2 publishers on {INFO}, expected one: /driver, /player"
     )
+
+
+@pytest.mark.parametrize(
+    ("seen", "told"),
+    [
+        ({"frame_id": "camera"}, []),
+        ({"frame_id": ""}, [f"images on {DEPTH} have an empty frame_id, expected the camera's optical frame"]),
+        ({"distorted": True}, [f"{INFO} has lens distortion (D), and {DEPTH} is taken for rectified (image_proc)"]),
+    ],
+)
+def test_images_that_cannot_be_what_they_are_taken_for(seen: dict[str, object], told: list[str]) -> None:
+    assert input_warnings(view(**seen)) == told
 
 
 def test_lines_of_a_kind_are_logged_once_in_ten_seconds(clock: list[float]) -> None:

@@ -143,6 +143,15 @@ def test_a_table_found_in_the_image_is_not_taken_for_the_cameras_table(frames, p
         frames("table").find(found, CameraPose(None, "none", "/camera_pose: no pose yet from driver"), 0.0)
 
 
+def test_a_table_of_one_image_is_told_where_poses_are_in_its_frame(frames, posterior) -> None:
+    found = replace(posterior, table_found=True)
+    assert (
+        frames("table").unplaced(found).startswith("no camera pose: poses in 'bench' (output_frame) are in a frame of")
+    )
+    assert not frames("table").unplaced(posterior)
+    assert not frames("").unplaced(found) and not frames("robot", MadeUpTf({})).unplaced(found)
+
+
 def test_tf_is_asked_through_the_table_where_it_can_be_and_else_through_the_camera(frames, posterior) -> None:
     T_robot_camera = pose_matrix([1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
     known = {"bench": T_ROBOT_TABLE, "camera": T_robot_camera}
