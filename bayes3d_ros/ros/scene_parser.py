@@ -126,6 +126,8 @@ class SceneParserNode(Node):
         """Stop listening, for good."""
         self._close_inputs()
         self._parse.refuse_all("the node was shut down")
+        self._preparation.forget()
+        super().on_deactivate(state)  # rclpy leaves the publishers of an active node open
         return super().on_shutdown(state)
 
     def stop(self, timeout: float) -> bool:
