@@ -215,8 +215,9 @@ def _meet(word: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> tupl
     """Where rays meet a word's plane, and whether they enter what lies behind it."""
     normal = [_byte(word, shift) for shift in (24, 16, 8)]
     facing = jnp.asarray(sum(n * c for n, c in zip(normal, d, strict=True)))
+    facing = jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing)
     apart = _byte(word, 0) * OFFSET_RANGE - sum(n * r for n, r in zip(normal, from_centre, strict=True))
-    return apart / jnp.where(jnp.abs(facing) < 1e-6, 1e-6, facing), facing < 0
+    return apart / facing, facing < 0
 
 
 def at_edge(look_up: Callable, word: Array, edges: Array, from_centre: Sequence[Array], d: Sequence[Array]) -> Array:

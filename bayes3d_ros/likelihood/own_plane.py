@@ -7,12 +7,16 @@ In each block of the image the surface is a plane of its own, about a surface th
 
     d = m + b_0 + b_1 x + b_2 y,    b_0 ~ N(0, `DEPTH_SD`^2),    b_1, b_2 ~ N(0, 1),    x and y metres,
 
-and its returns err as those of any surface do. With probability 1 - `ANEW` a block goes on from the block to its left
-or from the block above, where there are such: its plane is then the plane of that block, as the returns of that block
-alone tell it, turned by N(0, bend^2) along either axis, half of it between the middles of the two blocks, and displaced
-by N(0, step^2). It goes on flat with probability `FLAT_SHARE`, with a step and a bend no larger than a camera's errors
-make them from block to block (`FLAT`), else it bends (`BENT`). So the density of a block's returns depends only on the
-blocks to its left and above, and the product over all blocks integrates to one over all depths.
+with m the median of the block's own returns, and its returns err as those of any surface do. (So b_0 says nothing of
+how far the surface is, and the density of a block that does not go on from another is no density over depth: over a
+range R of depths it integrates to R / (sqrt(2 pi) `DEPTH_SD`), some 12 over 0.9 m, or 2.5 nats for each such block. The
+experiments that draw unknown surfaces count that: `validation/reference/shared_error_predictive.py`.)
+
+With probability 1 - `ANEW` a block goes on from the block to its left or from the block above, where there are such:
+its plane is then the plane of that block, as the returns of that block alone tell it, turned by N(0, bend^2) along
+either axis, half of it between the middles of the two blocks, and displaced by N(0, step^2). It goes on flat with
+probability `FLAT_SHARE`, with a step and a bend no larger than a camera's errors make them from block to block
+(`FLAT`), else it bends (`BENT`). So the density of a block's returns depends only on the blocks to its left and above.
 
 Each block's integral is computed by Laplace's method about the plane that its returns make likeliest, for all its
 returns that stand in front of the table, and is divided evenly among these returns: a surface pays only for the part of

@@ -68,7 +68,7 @@ WIDEST_EDGES = 1.0
 LOST_SHARE, LOST_DEPTH = 0.5, 0.3  # of `edge_share`; metres over which such returns are spread
 BLOCK_SIDE = 0.015  # metres at the reference depth: the table's median in the image
 LEAST_BLOCK = 2  # pixels
-# Of a Beta distribution with the mean of `bad_share`: quantiles and weights stand for it (three, as of an object).
+# Times `bad_share`: three values that the share of bad cells of an object may have (their weighted mean is 1.1).
 BAD_SPREAD = (0.35, 1.0, 2.5)
 BAD_WEIGHT = (0.3, 0.5, 0.2)
 # Steps to a cell's modes, and to the mode of an object's shared error

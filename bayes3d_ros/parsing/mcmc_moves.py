@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayes3d_ros.objects.library_arrays import LibraryArrays
 from bayes3d_ros.objects.placement import Placement, Table, shifted
@@ -42,6 +42,13 @@ def jump(key: PRNGKeyArray, placement: Placement, library: LibraryArrays) -> Pla
     type_id, face = jnp.maximum(placement.type, 0), jnp.maximum(placement.face, 0)
     there = shifted(placement, library.alike_face[type_id, face, way], library.alike_shift[type_id, face, way])
     return there._replace(yaw=jnp.mod(there.yaw, 2 * jnp.pi))
+
+
+def possible(log_ratio: Float[Array, "N"], log_prior: Float[Array, "N"], clash: Bool[Array, "N"]) -> Float[Array, "N"]:
+    """log ratios of target to proposal; -inf of placements that the prior leaves out, or whose solids clash with
+    others. (A draw at the rim of the proposal's last square may be rounded to a place beyond the table, which the
+    proposal lacks as well: the difference of two infinities is no number, and one of these would spoil the stage.)"""
+    return jnp.where(clash | jnp.isneginf(log_prior), -jnp.inf, log_ratio)
 
 
 class Proposed(NamedTuple):

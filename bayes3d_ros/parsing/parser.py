@@ -158,7 +158,7 @@ class SceneParser:
         """Stages of the sampler, from the empty table to one number of known objects more than the image
         supports; and the effective fraction of each but the first, of the run that found the likeliest."""
         runs = sampler_runs(key, *models, self.settings, max(self.capacity, 1))
-        if any(run.peaks[-1] >= fewest_moved(self.settings.tempering_steps) for run in runs):
+        if any(max(run.peaks, default=0) >= fewest_moved(self.settings.tempering_steps) for run in runs):
             self._compiled.add(models.context.image.depth.shape)  # the last of the slow ones
         return self._stages(key, runs, models.model, seen), likeliest(runs).ess
 
@@ -192,9 +192,10 @@ class SceneParser:
     ) -> Stage:
         """The scenes of `count` known objects, with noise and unknown things sampled."""
         slots = max(self.settings.max_objects, 1)  # those beyond are empty
-        noise = self._sample_noise(key, model, state.loglik_grid)
-        gauss = self._gauss(jax.random.fold_in(key, 2), state.objects.x.shape)
-        seed_of_things = jax.random.key_data(jax.random.fold_in(key, 3))
+        noise_key, gauss_key, things_key = jax.random.split(key, 3)
+        noise = self._sample_noise(noise_key, model, state.loglik_grid)
+        gauss = self._gauss(gauss_key, state.objects.x.shape)
+        seed_of_things = jax.random.key_data(things_key)
         (objects, off, log_weight, log_evidence, lineage), gauss, noise, seed_of_things = jax.device_get(
             (
                 (state.objects, state.warp[..., -1], state.log_weight, state.log_evidence, state.lineage),

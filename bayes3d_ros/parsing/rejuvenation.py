@@ -22,7 +22,7 @@ from bayes3d_ros.likelihood.image_model import ImageModel, gain, log_marginal, w
 from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, log_order, solo_gain_of
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
+from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new, possible
 from bayes3d_ros.parsing.proposal import Proposal, log_density
 from bayes3d_ros.parsing.search import conflicts
 from bayes3d_ros.parsing.tuning import SAMPLER
@@ -119,10 +119,11 @@ def _move(
     def with_terms(ancestor, placement, grid_here, warp, solo_gain) -> Proposed:
         log_likelihood = log_marginal(model, grid_here)
         log_q = log_density(placement, proposal, library, table)
-        log_target = log_likelihood + log_prior(placement, library, table) + log_order(solo_gain, count)
+        log_p = log_prior(placement, library, table)
+        log_target = log_likelihood + log_p + log_order(solo_gain, count)
         log_ratio = log_target - log_likelihood_without[ancestor] - log_q
         clash = conflicts(placement, jax.tree.map(lambda a: a[ancestor], rest), count - 1, library)
-        log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
+        log_ratio = possible(log_ratio, log_p, clash)
         return Proposed(ancestor, placement, grid_here, log_likelihood, log_q, log_ratio, warp, solo_gain=solo_gain)
 
     def extend(ancestor: Int[Array, "N"], placement: Placement) -> Proposed:

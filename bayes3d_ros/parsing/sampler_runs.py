@@ -6,7 +6,7 @@ Where nothing unknown is allowed there are two runs. A large object may explain 
 neighbours whose place it takes. All particles of the first stage then hold it, and later stages can only add to it. So
 a second run has other targets on its way, in which returns in front of a scene are those of something unknown: a scene
 loses little by what it does not explain yet, and much by hiding it. Its scenes are weighted anew under the model
-(`retarget.py`). Alone it would not do: of things that no type fits it prefers to find none.
+(`retarget.py`). Alone it is not enough: where no type fits an object, it tends to find none there.
 
 Each run gives an unbiased estimate of Z_n, so their mean is one (`samples.py`, `pooled`). A run that finds less than
 the other by `MISSED_NATS` has missed what the other found: it is left out, since the mean would halve Z_n.
@@ -26,6 +26,7 @@ from bayes3d_ros.parsing.context import Context
 from bayes3d_ros.parsing.posterior_constants import LEAST_LIKELY_COUNT, MISSED_NATS
 from bayes3d_ros.parsing.rejuvenation import Effort, fewest_moved
 from bayes3d_ros.parsing.retarget import retargeted
+from bayes3d_ros.sampling.resampling import effective_fraction
 from bayes3d_ros.settings import ParserSettings
 
 _SECOND_RUN = 3000  # folded into a frame's key
@@ -36,13 +37,15 @@ class SamplerRun(NamedTuple):
     """Weighted scenes of 0, 1, ... known objects."""
 
     states: list[smc.Population]
-    log_mass: list[float]  # log P(n) Z_n, up to a constant
+    log_mass: list[float]  # log P(n) Z_n, up to a constant; -inf of numbers that are not allowed
     ess: list[float]  # of each number of objects from 1 on, as a fraction
 
     @property
     def peaks(self) -> list[int]:
-        """Numbers of objects that are likelier than all smaller ones and the next; the last is the likeliest."""
-        return [n for n, mass in enumerate(self.log_mass) if mass == max(self.log_mass[: n + 2])]
+        """Numbers of objects that are likelier than all smaller ones and the next; the last is the likeliest. None
+        where no number has any mass."""
+        masses = enumerate(self.log_mass)
+        return [n for n, mass in masses if mass == max(self.log_mass[: n + 2]) and np.isfinite(mass)]
 
     @property
     def best_log_mass(self) -> float:
@@ -135,11 +138,18 @@ def _run(key: PRNGKeyArray, frame: _Frame, guide: ImageModel | None) -> SamplerR
             settings.ess_threshold,
         )
         states.append(_under_model(ahead, count + 1, frame, guide))
-        ess.append(float(info.ess))
+        ess.append(float(info.ess) if guide is None else min(float(info.ess), _effective(states[-1])))
         log_mass.append(float(states[-1].log_evidence) + (count + 1) * np.log(settings.known_ratio))
         if not np.isfinite(log_mass[-1]) or (not fixed and log_mass[-1] < max(log_mass) + frame.least_likely):
             break
+    if fixed and not settings.knows_unknown:
+        log_mass = [mass if n == settings.fixed_objects else -np.inf for n, mass in enumerate(log_mass)]
     return SamplerRun(states, log_mass, ess)
+
+
+def _effective(state: smc.Population) -> float:
+    """The effective fraction of the scenes, after they were weighted anew."""
+    return float(effective_fraction(state.log_weight))
 
 
 def _under_model(ahead: smc.Population, count: int, frame: _Frame, guide: ImageModel | None) -> smc.Population:

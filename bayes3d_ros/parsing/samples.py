@@ -215,10 +215,12 @@ def _table_bias(
 
     The likelihood sees an object's depth error against the table's returns: the table's own error is half of the
     variance bias^2, and common to all objects; the other half is each object's own. The table's error given those of n
-    objects is normal with mean n / (n + 1) times their mean and variance bias^2 / (2 (n + 1)).
+    objects is normal with mean n / (n + 1) times their mean and variance bias^2 / (2 (n + 1)). Of an object without a
+    cell in sight nothing was seen: its `off` is 0, and it is none of the n.
     """
-    number = held.sum(1)
-    return ((off * held).sum(1) + bias * np.sqrt((number + 1) / 2) * gauss) / (number + 1)
+    seen = held & (off != 0.0)
+    number = seen.sum(1)
+    return ((off * seen).sum(1) + bias * np.sqrt((number + 1) / 2) * gauss) / (number + 1)
 
 
 def _along_rays(T: Float[np.ndarray, "S M 4 4"], depth: Float[np.ndarray, "S"]) -> Float[np.ndarray, "S M 4 4"]:

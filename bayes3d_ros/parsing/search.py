@@ -286,11 +286,11 @@ def _searched(
     modes, value = best_first(modes, value, len(value))
     others = SEARCH.finalists - SEARCH.finalist_types
     modes = types_first(modes, value, SEARCH.finalists_apart, (1, SEARCH.finalist_types), others, library)
-    exact, marginal = _targets(take(modes.placement, slice(1)), scene, context, model, window)
+    fitted, marginal = _targets(take(modes.placement, slice(1)), scene, context, model, window)
     rounds = SEARCH.fit_rounds if isinstance(model, NoiseGrid) else SEARCH.shared_fit_rounds
-    modes, value = sharpen(sharpen_key, modes, exact, SEARCH.fit_draws, rounds)
+    modes, value = sharpen(sharpen_key, modes, fitted, SEARCH.fit_draws, rounds)
     mixture, pilots = adapt(adapt_key, as_mixture(modes, value), marginal, library, table)
-    return with_self_symmetry(mixture, exact, library), pilots
+    return with_self_symmetry(mixture, fitted, library), pilots
 
 
 def _targets(
@@ -313,10 +313,10 @@ def _targets(
     part = near_peak(grid_then, model)
     rows = jnp.searchsorted(model.coarse.sigma, part.coarse.sigma)
 
-    def exact(placement: Placement) -> Float[Array, "N"]:
+    def fitted(placement: Placement) -> Float[Array, "N"]:
         return _gains(placement, scene.depth, context, noise, window)
 
-    return exact, _marginal_gains(part, scene.loglik_grid[rows], scene, context, window)
+    return fitted, _marginal_gains(part, scene.loglik_grid[rows], scene, context, window)
 
 
 def _marginal_gains(

@@ -28,7 +28,7 @@ from bayes3d_ros.objects.placement import Placement, log_prior
 from bayes3d_ros.parsing.backward_kernel import Empty, empty_table, log_last, solo_gain_of
 from bayes3d_ros.parsing.coarse_search import cell_grid
 from bayes3d_ros.parsing.context import Context
-from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new
+from bayes3d_ros.parsing.mcmc_moves import Proposed, move_new, possible
 from bayes3d_ros.parsing.mode_search import COMPONENTS
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose
 from bayes3d_ros.parsing.rejuvenation import Effort, GivenFrame, WeightedScenes, rejuvenate
@@ -123,10 +123,11 @@ def step(
         summed = state.loglik_grid[ancestor] + gained
         log_likelihood = log_marginal(model, summed)
         log_q = log_density(new, proposal, library, table)
-        log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_prior(new, library, table) - log_q
+        log_p = log_prior(new, library, table)
+        log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_p - log_q
         others = jax.tree.map(lambda a: a[ancestor], state.objects)
         clash = conflicts(new, others, count, library)
-        log_ratio = jnp.where(clash, -jnp.inf, log_ratio)
+        log_ratio = possible(log_ratio, log_p, clash)
         lineage = jnp.arange(len(ancestor))
         return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, warp, lineage)
 

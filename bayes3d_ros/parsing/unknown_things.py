@@ -13,6 +13,10 @@ where the second line is the prior of one more thing, and of what it stands on: 
 behind is uniform between the visible depth and the larger of the visible sides. Its other ends lie anywhere between the
 outermost returns and the next ones, which are not the thing's.
 
+Two terms of the likelihood are left out of these odds, where a thing touches a known object in the image: the prior of
+seams, and pixels at which depth goes on to the object (`slow_pixel_kinds.py`). A thing has hundreds of nats, and a seam
+costs five a pixel's side.
+
 A smaller region is neither: its returns keep the density of an unknown surface, and there is no thing.
 
 Where the prior has a region, a thing whose middle lies outside is neither reported nor counted; its returns stay what
@@ -140,8 +144,9 @@ def in_front(
 
 
 def before_the_table(seen: Observation) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold all returns in front of the bare table, and a pixel about them. No scene
-    is behind the bare table, so that no other return stands in front of one."""
+    """Rows and columns of the image that hold all returns in front of the bare table, and a pixel about them. Scenes do
+    not lie behind the bare table (but for the shared error of an object at its foot, which is less than the margin), so
+    that no other return stands in front of one."""
     errors = seen.errors
     assert errors is not None
     height, width = seen.depth.shape
@@ -166,7 +171,7 @@ def _things(mask: Bool[np.ndarray, "h w"], seen: Observation) -> tuple[UnknownTh
     camera = -T[:3, :3].T @ T[:3, 3]
     found = []
     for k in np.argsort(-np.bincount(regions.ravel(), minlength=count + 1)[1:], kind="stable") + 1:
-        if area[k] < LEAST_THING or log_gain[k] <= 0:
+        if area[k] < LEAST_THING:
             continue
         own = regions == k
         size, centre, yaw, behind = _box(points[own], camera[:2])

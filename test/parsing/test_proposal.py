@@ -13,6 +13,7 @@ from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement, Table, log_prior
+from bayes3d_ros.parsing.mcmc_moves import possible
 from bayes3d_ros.parsing.proposal import Modes, Proposal, log_density, propose, wrap
 from bayes3d_ros.parsing.tuning import SEARCH
 
@@ -192,3 +193,19 @@ def test_draws_follow_the_density(drawn, arrays, table):
         error = value.std() / np.sqrt(COUNT)
         assert error < 0.12
         assert value.mean() == pytest.approx(1, abs=4 * error)
+
+
+def test_a_draw_that_is_rounded_off_the_table_weighs_nothing(arrays):
+    """In a table's last square the largest draws are rounded to the square beyond it, of which neither prior nor
+    proposal has any: their difference is no number."""
+    wide = Table(jnp.eye(4), jnp.array([1.0, 1.0]))
+    cells = jnp.full((50, 50), 1 / 2500)
+    over = proposal()._replace(cells=cells)
+    share = jnp.float32(1 - 2.0**-23)
+    x = jnp.float32(49) * SEARCH.cell - wide.size[0] / 2 + SEARCH.cell * share
+    there = placements(0, 0, [float(x), 0.3], [0.0, 0.0], [0.5, 0.5])
+    log_p, log_q = log_prior(there, arrays, wide), log_density(there, over, arrays, wide)
+    assert np.isneginf(log_p[0]) and np.isneginf(log_q[0]) and np.isnan(log_p - log_q)[0]
+    ratio = possible(log_p - log_q, log_p, jnp.array([False, False]))
+    assert np.isneginf(ratio[0]) and np.isfinite(ratio[1])
+    assert np.isneginf(possible(log_p - log_q, log_p, jnp.array([False, True]))).all()

@@ -21,8 +21,8 @@ def test_the_tables_bias_is_normal_given_those_of_objects(number):
     rng = np.random.default_rng(number)
     off = np.zeros((draws, 6))
     off[:, :number] = rng.normal(0.004, 0.002, number)
-    off[:, number:] = 99.0  # empty slots
-    held = np.arange(6) < number
+    off[:, number + 1 :] = 99.0  # empty slots; the last object is hidden, so that nothing is seen of its error
+    held = np.arange(6) <= number
     drawn = _table_bias(off, np.tile(held, (draws, 1)), rng.standard_normal(draws), BIAS)
     half = BIAS**2 / 2
     seen = half * (np.ones((number, number)) + np.eye(number))

@@ -173,6 +173,16 @@ def test_a_region_is_a_thing_with_its_odds_against_outliers(monkeypatch, odds):
     assert share == pytest.approx(p, abs=4 * (p * (1 - p) / scenes) ** 0.5)
 
 
+def test_a_region_that_is_no_surface_costs_no_more_than_outliers(monkeypatch):
+    """The likelihood has scored it as a surface, which outliers may well be likelier than."""
+    seen = observe(plain_frame(BRICK, BALL), SETTINGS)
+    monkeypatch.setattr(unknown_things, "_over_outliers", lambda seen: np.full(seen.depth.shape, -0.1))
+    found = unknown_things.find_things(
+        np.asarray(seen.image.bare_depth)[None], seen, 0.0, 3, False, np.random.default_rng(0)
+    )
+    assert found.held == [()] and found.log_weight[0] > 10.0
+
+
 def test_with_room_for_one_the_likelier_thing_is_told(monkeypatch):
     """Of two things the one that gains less is likelier, where the other would stand on a known object."""
     seen = observe(plain_frame(BRICK, BALL), SETTINGS)

@@ -34,6 +34,7 @@ _MODULES = ("bayes3d_ros.likelihood.cpu.gain", "bayes3d_ros.parsing.coarse_searc
 COMPILES = "BAYES3D_COMPILES_HERE"  # environment variable: this process compiles what is not on disk
 # Files of all functions that are compiled, and of constants that they use.
 SOURCES = (
+    "geometry/edges.py",
     "likelihood/cpu/*.py",
     "likelihood/density.py",
     "likelihood/error_nodes.py",
