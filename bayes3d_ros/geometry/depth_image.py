@@ -90,21 +90,30 @@ def intrinsics_from_camera_info(
     width: int,
     height: int,
     image_size: tuple[int, int] | None = None,
+    binning: tuple[int, int] = (0, 0),
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
 ) -> Intrinsics:
     """Intrinsics from the fields of a sensor_msgs/CameraInfo: from P where it is set (rectified images), else from K.
 
     k has 9 entries and p 12, row by row; width and height are CameraInfo's, `image_size` is (width, height) of the
-    image it goes with. Raises ValueError, one line that names the field, where they cannot be used or sizes disagree,
-    or where no camera has such a focal length or principal point.
+    image it goes with. Where that is another one, `binning` (x, y) and `roi` (x_offset, y_offset, width, height; all 0:
+    the whole image) must lead to it: then K and P are those of the whole image (sensor_msgs/CameraInfo), and pixels of
+    the image are as many neighbours of the region. Raises ValueError, one line that names the field, where they cannot
+    be used or sizes disagree, or where no camera has such a focal length or principal point.
     """
     if len(k) != 9:
         raise ValueError(f"CameraInfo K: expected 9 values, got {len(k)}")
     if len(p) not in (0, 12):
         raise ValueError(f"CameraInfo P: expected 12 values, got {len(p)}")
-    if image_size is not None and (width, height) != tuple(image_size):
-        raise ValueError(
-            f"CameraInfo width, height: expected the image's {image_size[0]}x{image_size[1]}, got {width}x{height}"
-        )
+    x_offset, y_offset, *region = roi
+    whole = (width, height) if not any(region) else tuple(region)
+    bins = tuple(max(each, 1) for each in binning)
+    binned = whole[0] // bins[0], whole[1] // bins[1]
+    same = image_size is None or (width, height) == tuple(image_size)
+    if image_size is not None and not same and binned != tuple(image_size):
+        other = f" ({binned[0]}x{binned[1]} with its roi and binning)" if binned != (width, height) else ""
+        expected = f"the image's {image_size[0]}x{image_size[1]}"
+        raise ValueError(f"CameraInfo width, height: expected {expected}, got {width}x{height}{other}")
     if len(p) == 12 and p[0] != 0:
         name, values, at = "P", p, (0, 5, 2, 6)
     else:
@@ -123,4 +132,7 @@ def intrinsics_from_camera_info(
             expected = f"a principal point within {_FARTHEST_CENTRE * size:g} pixels of the middle"
             raise ValueError(f"CameraInfo {name}[{i}]: expected {expected} at {width}x{height}, got {values[i]:g}")
     fx, fy, cx, cy = (float(values[i]) for i in at)
-    return Intrinsics(fx, fy, cx, cy, int(width), int(height))
+    if same:
+        return Intrinsics(fx, fy, cx, cy, int(width), int(height))
+    used = Intrinsics(fx, fy, cx - x_offset, cy - y_offset, binned[0] * bins[0], binned[1] * bins[1])
+    return used.resized(*binned)

@@ -149,7 +149,9 @@ class FrameReader:
             return t != stamp, (info.width, info.height) != size, t > stamp, abs(t - stamp)
 
         info = min(self._infos, key=closeness)[1]
-        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, size)
+        roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+        binning = info.binning_x, info.binning_y
+        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, size, binning, roi)
 
 
 class BagWriter:

@@ -125,8 +125,7 @@ def step(
         log_q = log_density(new, proposal, library, table)
         log_p = log_prior(new, library, table)
         log_ratio = log_likelihood - state.log_likelihood[ancestor] + log_p - log_q
-        others = jax.tree.map(lambda a: a[ancestor], state.objects)
-        clash = conflicts(new, others, count, library)
+        clash = conflicts(new, jax.tree.map(lambda a: a[ancestor], state.objects), count, library)
         log_ratio = possible(log_ratio, log_p, clash)
         lineage = jnp.arange(len(ancestor))
         return Proposed(ancestor, new, summed, log_likelihood, log_q, log_ratio, warp, lineage)

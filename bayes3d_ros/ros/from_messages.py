@@ -38,7 +38,9 @@ class CameraInfoError(ValueError):
 def intrinsics_from_message(info: CameraInfo, width: int, height: int) -> Intrinsics:
     """The intrinsics of an image of this size. Raises CameraInfoError."""
     try:
-        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height))
+        roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+        binning = info.binning_x, info.binning_y
+        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height), binning, roi)
     except ValueError as error:
         raise CameraInfoError(str(error)) from None
 

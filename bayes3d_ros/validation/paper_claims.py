@@ -232,7 +232,8 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         "Real single-object and multi-object scenes are parsed robustly, occluded objects included",
         "Fig. 5", FIGURE_ONLY, "real-scenes", "90 % of all things right, at most 10 % too many",
-        partial(scenes_right, "meshes"), "see the pictures; a foreign thing that is called by a type counts as wrong",
+        partial(scenes_right, "meshes"),
+        "see the pictures that the experiment draws; a foreign thing that is called by a type counts as wrong",
     ),
     Claim(
         "So they are with models that were learned of each object on its own",

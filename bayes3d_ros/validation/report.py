@@ -14,6 +14,7 @@ from bayes3d_ros.validation.experiments import EXPERIMENTS, Wanted
 _WIDTH = 120
 _MOST_COLUMNS = 6  # groups of a summary side by side in one table
 
+_UNITS = "Metres, radians, seconds and nats, where a name has no unit of its own (mm, cm, deg); shares are of 1."
 RESULTS = "results"  # folder beside the pages: their JSON and pictures
 
 Report = Mapping[str, Any]  # the JSON of an experiment
@@ -54,7 +55,7 @@ def page(report: Report, about: str, wanted: Wanted, pictures: Sequence[str] = (
     parts.append(markdown_table(("", ""), _circumstances(report)))
     if notes := report.get("notes"):
         parts.append("\n".join(f"- {note}" for note in notes))
-    parts += ["## Summary", *_summary_tables(report["summary"], wanted)]
+    parts += ["## Summary", _UNITS, *_summary_tables(report["summary"], wanted)]
     parts += [f"![{picture}]({RESULTS}/{picture})" for picture in pictures]
     parts.append(f"All rows: [{RESULTS}/{name}.json]({RESULTS}/{name}.json).")
     parts.append("[evaluations.md](../evaluations.md) explains every number.")

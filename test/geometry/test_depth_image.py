@@ -96,6 +96,35 @@ def test_intrinsics_come_from_p_where_set_else_k():
 
 
 @pytest.mark.parametrize(
+    ("binning", "roi", "size"),
+    [
+        ((2, 2), (0, 0, 0, 0), (320, 240)),
+        ((0, 0), (100, 50, 200, 120), (200, 120)),
+        ((3, 2), (100, 50, 200, 120), (66, 60)),
+        ((1, 1), (0, 0, 640, 480), (640, 480)),
+    ],
+)
+def test_a_region_and_binning_lead_from_the_whole_image_to_this_one(binning, roi, size):
+    """Against rays: the middle of a pixel is the mean of the middles of those that are binned into it."""
+    whole = intrinsics_from_camera_info(K, P, 640, 480)
+    made = intrinsics_from_camera_info(K, P, 640, 480, size, binning, roi)
+    bins = [max(n, 1) for n in binning]
+    rows, columns = (
+        slice(first, first + n * b) for first, n, b in zip(roi[1::-1], size[::-1], bins[::-1], strict=True)
+    )
+    blocks = whole.rays()[rows, columns].reshape(size[1], bins[1], size[0], bins[0], 3)
+    np.testing.assert_allclose(made.rays(), blocks.mean((1, 3)), atol=1e-6)
+    assert (made.width, made.height) == size
+
+
+def test_a_region_that_does_not_lead_to_the_image_is_told():
+    line = "CameraInfo width, height: expected the image's 100x100, got 640x480 (100x60 with its roi and binning)"
+    with pytest.raises(ValueError) as error:
+        intrinsics_from_camera_info(K, P, 640, 480, (100, 100), (2, 2), (100, 50, 200, 120))
+    assert str(error.value) == line
+
+
+@pytest.mark.parametrize(
     ("k", "p", "size", "line"),
     [
         ([0.0] * 9, [0.0] * 12, (640, 480), r"CameraInfo K\[0\]: expected a focal length > 0, got 0"),
