@@ -242,8 +242,8 @@ def _turned_again(
 def _best_turns(
     modes: Hypotheses, value: Float[Array, "N"], gains: Gains, library: LibraryArrays
 ) -> tuple[Hypotheses, Float[Array, "M"]]:
-    """The best hypothesis of each of `turned_types` types is turned all around; of each, the `turns_kept` peaks that
-    gain most, and what they gain."""
+    """The best hypothesis of each of `turned_types` types is turned all around. Of its peaks the highest of each type,
+    and then those that gain most, `turns_kept` for each type on the whole; and what they gain."""
     types = min(SEARCH.turned_types, len(value))
     first = best_of_types(modes.placement.type, value, 1, types)
     source, _ = best_first(modes, jnp.where(first, value, -jnp.inf), types)
@@ -251,8 +251,11 @@ def _best_turns(
     gained = gains(copies.placement).reshape(types, TURNED)
     peak = (gained >= jnp.roll(gained, 1, 1)) & (gained >= jnp.roll(gained, -1, 1))
     peak &= jnp.arange(TURNED) > 0  # the first is the hypothesis itself
-    best, turn = jax.lax.top_k(jnp.where(peak, gained, -jnp.inf), SEARCH.turns_kept)
-    return take(copies, (turn + TURNED * jnp.arange(types)[:, None]).ravel()), best.ravel()
+    height = jnp.where(peak, gained, -jnp.inf)
+    highest = height.argmax(1) + TURNED * jnp.arange(types)
+    _, others = jax.lax.top_k(height.ravel().at[highest].set(-jnp.inf), types * (SEARCH.turns_kept - 1))
+    chosen = jnp.concatenate([highest, others])
+    return take(copies, chosen), height.ravel()[chosen]
 
 
 def _searched(

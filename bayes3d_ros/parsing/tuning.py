@@ -50,8 +50,8 @@ class SearchTuning(NamedTuple):
     early_a_type: int = 4  # hypotheses of each of these types followed for a few rounds first; slivers
     early_draws: int = 8  # draws for each mode and round of these; slivers
     early_rounds: int = 4  # tables of several things: the worst of eight misses 9 nats of evidence with 2, 2 with 4
-    # Types of which the best is turned all around, and turns kept of each: a mug in plain view (three_objects) was
-    # missed at its yaw, by 60 nats, with two seeds of four.
+    # Types of which the best is turned all around, and turns kept for each, on the whole: a mug in plain view
+    # (three_objects) was missed at its yaw, by 60 nats, with two seeds of four.
     turned_types: int = 6
     turns_kept: int = 2
     turned_rounds: int = 3  # in which these are followed by a model of shared errors
@@ -85,7 +85,8 @@ class SearchTuning(NamedTuple):
     shared_fit_rounds: int = 2  # as `fit_rounds`
     fit_draws: int = 24  # draws for each mode and round of the paraboloid; not recorded
     fit_rounds: int = 5  # not recorded
-    finalists: int = 10  # modes that become components of the mixture; slivers
+    # Modes that become components of the mixture; slivers, and the yaws of a hidden handle (moving_camera).
+    finalists: int = 14
     finalist_types: int = 6  # of these, how many are the best of their types; slivers
     finalists_apart: tuple[float, float] = (0.006, 0.15)  # m, rad: of a type and face, nearer are copies; not recorded
     inflation: float = 1.5  # factor from a mode's covariance to its component's; not recorded

@@ -13,7 +13,8 @@ from bayes3d_ros.objects.model import Library
 from bayes3d_ros.objects.placement import Placement
 from bayes3d_ros.objects.self_symmetry import TURNED
 from bayes3d_ros.parsing.mode_search import Hypotheses, factor, log_shares, sharpen
-from bayes3d_ros.parsing.search import _with_turns
+from bayes3d_ros.parsing.search import _best_turns, _with_turns
+from bayes3d_ros.parsing.tuning import SEARCH
 
 
 def test_a_type_of_a_few_percent_is_drawn_however_many_modes_the_other_has():
@@ -44,14 +45,35 @@ def test_factors_of_covariances_that_rounding_made_indefinite():
     np.testing.assert_allclose(scale @ scale.swapaxes(1, 2), covariance, rtol=2e-5, atol=1e-11)
 
 
-def test_the_turn_at_which_a_handle_fits_is_found_from_any_other():
-    """Of a can with a handle, gains that fall with the body's distance from its place and the handle's from its yaw."""
+def mug_and_brick():
+    """A can with a handle, type 0, and a box."""
     can = trimesh.creation.cylinder(0.04, 0.1, sections=64)
     handle = trimesh.creation.box((0.03, 0.012, 0.05)).apply_translation((0.05, 0.0, 0.0))
     brick = trimesh.creation.box((0.05, 0.06, 0.07))
     meshes = {"mug": trimesh.util.concatenate([can, handle]), "brick": brick}
-    models = tuple(model_from_mesh(mesh, name, 0.004) for name, mesh in meshes.items())
-    library = library_arrays(Library(models))
+    return library_arrays(Library(tuple(model_from_mesh(mesh, name, 0.004) for name, mesh in meshes.items())))
+
+
+def test_turns_that_are_followed_are_the_best_of_each_type_and_then_those_that_gain_most():
+    library = mug_and_brick()
+    peaks = np.array([0.5, 1.4, 2.3, 3.2])
+
+    def gains(at):
+        off = jnp.abs((at.yaw[:, None] - peaks + jnp.pi) % (2 * jnp.pi) - jnp.pi).min(1)
+        return jnp.where(at.type == 0, 1000.0, 10.0) - off
+
+    start = Placement(jnp.array([0, 1]), jnp.array([5, 5]), *(jnp.zeros(2) for _ in range(3)))
+    turns, _ = _best_turns(Hypotheses(start, jnp.tile(0.01 * jnp.eye(3), (2, 1, 1))), gains(start), gains, library)
+    kept = np.asarray(turns.placement.type)
+    assert len(kept) == 2 * SEARCH.turns_kept and (kept == 1).sum() == 1
+    yaws = np.sort(np.asarray(turns.placement.yaw)[kept == 0])
+    assert all(np.abs(yaw - peaks).min() <= np.pi / TURNED + 1e-3 for yaw in yaws)
+    assert (np.diff(yaws) > 0.5).all()
+
+
+def test_the_turn_at_which_a_handle_fits_is_found_from_any_other():
+    """Of a can with a handle, gains that fall with the body's distance from its place and the handle's from its yaw."""
+    library = mug_and_brick()
     face = next(f for f in range(NUM_FACES) if library.T_contact_object[0, f, 2, 2] > 0.9)
     axis = np.asarray(library.T_contact_object[0, face, :2, 3])  # of the can, from the middle of the mug's box
     place, right = np.array([0.1, -0.05]), 1.234
