@@ -26,7 +26,9 @@ def _rows(reports: Mapping[str, Report]) -> Iterator[tuple[str, str, str, str]]:
         question = _first_sentence(experiment.__doc__ or "")
         if report := reports.get(name):
             quick = " (quick)" if report.get("quick") else ""
-            limits = _limits(report["summary"].get("not_met"), bool(wanted(experiment)))
+            summary = report["summary"]
+            missed = summary.get("not_met", [] if summary.get("calibrated") is True else None)
+            limits = _limits(missed, bool(wanted(experiment)))
             yield f"[{name}]({name}.md)", question, limits, f"{commits(report)}{quick}"
         else:
             yield name, question, "", "not run"

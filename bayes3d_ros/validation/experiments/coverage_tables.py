@@ -22,6 +22,7 @@ from bayes3d_ros.posterior.types import ParseError, ScenePosterior
 from bayes3d_ros.validation.experiments import Row, Step
 from bayes3d_ros.validation.experiments.coverage import (
     COVERED_TYPES,
+    MOST_WIDE,
     SampledObject,
     object_row,
     quantity,
@@ -42,7 +43,6 @@ __all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summa
 # Size of the errors, of those that the settings are for -> the least and the largest share of truths in 90 % regions.
 LIMITS = {0.5: (0.86, 0.94), 1.0: (0.86, 0.94), 2.0: (0.86, 0.94), 3.0: (0.8, 1.0)}
 AMPLITUDES = tuple(LIMITS)
-MOST_WIDE = 4.0  # RMS errors: of a 90 % region
 TABLES, QUICK_TABLES = 100, 5  # for each amplitude
 FULL_SEED, QUICK_SEED = 600_000, 690_000
 OBJECTS = 2
