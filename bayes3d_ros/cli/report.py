@@ -4,13 +4,18 @@
 
 import json
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from bayes3d_ros.cli.errors import InputError
 from bayes3d_ros.cli.options import ANY, FOLDER
 from bayes3d_ros.files.atomic import whole_file
+
+if TYPE_CHECKING:
+    from bayes3d_ros.validation.report import Report
 
 
 @click.command()
@@ -25,7 +30,8 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
     added. In folders, files of other programs are passed over, and unfinished experiments are named on stderr; a file
     that you name must be a finished experiment.
 
-    overview.md lists all experiments: what each asks, which limits were missed, and at which commit.
+    overview.md lists all experiments: what each asks, which limits were missed, and at which commit; also those whose
+    reports are in OUT/results already.
 
     If any of them answers a claim of the Bayes3D paper, paper.md holds all of its claims against the reports that are
     given; claims of other experiments are "not run".
@@ -58,7 +64,7 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         copies |= {file.parent / picture: out / RESULTS / picture for picture in pictures}
     if not pages:
         raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
-    pages.append((out / OVERVIEW_PAGE, overview_page(contents)))
+    pages.append((out / OVERVIEW_PAGE, overview_page(_finished(out / RESULTS) | contents)))
     if answers_the_paper(contents):
         pages.append((out / PAPER_PAGE, paper_page(contents)))
     (out / RESULTS).mkdir(parents=True, exist_ok=True)
@@ -70,6 +76,18 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         with whole_file(path) as handle:
             handle.write(text.encode())
         click.echo(f"{path}")
+
+
+def _finished(results: Path) -> "dict[str, Report]":
+    """Finished reports of an earlier call, whose pages stay, by the names of their experiments."""
+    from bayes3d_ros.validation.report import ReportError, read_report
+
+    found = {}
+    for file, _ in _files([results] if results.is_dir() else []):
+        with suppress(ReportError):
+            content = read_report(file)
+            found[content["experiment"]] = content
+    return found
 
 
 def _files(reports: Iterable[Path]) -> Iterator[tuple[Path, bool]]:

@@ -97,9 +97,11 @@ def intrinsics_from_camera_info(
 
     k has 9 entries and p 12, row by row; width and height are CameraInfo's, `image_size` is (width, height) of the
     image it goes with. Where that is another one, `binning` (x, y) and `roi` (x_offset, y_offset, width, height; all 0:
-    the whole image) must lead to it: then K and P are those of the whole image (sensor_msgs/CameraInfo), and pixels of
-    the image are as many neighbours of the region. Raises ValueError, one line that names the field, where they cannot
-    be used or sizes disagree, or where no camera has such a focal length or principal point.
+    the whole image) must lead to it: then K and P are those of the whole image (sensor_msgs/CameraInfo), and a pixel of
+    the image is the upper left one of those that are binned into it, as image_proc and image_geometry have it.
+
+    Raises ValueError, one line that names the field, where they cannot be used or sizes disagree, or where no camera
+    has such a focal length or principal point.
     """
     if len(k) != 9:
         raise ValueError(f"CameraInfo K: expected 9 values, got {len(k)}")
@@ -134,5 +136,4 @@ def intrinsics_from_camera_info(
     fx, fy, cx, cy = (float(values[i]) for i in at)
     if same:
         return Intrinsics(fx, fy, cx, cy, int(width), int(height))
-    used = Intrinsics(fx, fy, cx - x_offset, cy - y_offset, binned[0] * bins[0], binned[1] * bins[1])
-    return used.resized(*binned)
+    return Intrinsics(fx / bins[0], fy / bins[1], (cx - x_offset) / bins[0], (cy - y_offset) / bins[1], *binned)

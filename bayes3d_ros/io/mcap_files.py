@@ -73,8 +73,9 @@ def topics(bag: Path) -> dict[str, Topic]:
     found: dict[str, Topic] = {}
     try:
         for message in raw_messages(bag):
-            count = found[message.topic].count if message.topic in found else 0
-            found[message.topic] = Topic(message.topic, message.msgtype, count + 1, message.latched)
+            before = found.get(message.topic, Topic(message.topic, message.msgtype, 0))
+            latched = before.latched or message.latched
+            found[message.topic] = Topic(message.topic, message.msgtype, before.count + 1, latched)
     except BagDamage as error:
         if not found:
             raise BagError(str(error)) from None

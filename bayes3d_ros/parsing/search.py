@@ -246,11 +246,12 @@ def _best_turns(
     and then those that gain most, `turns_kept` for each type on the whole; and what they gain."""
     types = min(SEARCH.turned_types, len(value))
     first = best_of_types(modes.placement.type, value, 1, types)
-    source, _ = best_first(modes, jnp.where(first, value, -jnp.inf), types)
+    source, best = best_first(modes, jnp.where(first, value, -jnp.inf), types)
     copies = turned(source, library)
     gained = gains(copies.placement).reshape(types, TURNED)
     peak = (gained >= jnp.roll(gained, 1, 1)) & (gained >= jnp.roll(gained, -1, 1))
     peak &= jnp.arange(TURNED) > 0  # the first is the hypothesis itself
+    peak &= jnp.isfinite(best)[:, None]  # where there are fewer types, the others are copies
     height = jnp.where(peak, gained, -jnp.inf)
     highest = height.argmax(1) + TURNED * jnp.arange(types)
     _, others = jax.lax.top_k(height.ravel().at[highest].set(-jnp.inf), types * (SEARCH.turns_kept - 1))

@@ -52,9 +52,10 @@ class BagPlayer(Node):
             except ImportError:
                 self.get_logger().warning(f"{name} is left out: {topic.msgtype} is not installed")
                 continue
-            latched = topic.latched or name.split("/")[-1] == "tf_static"
+            static = name.split("/")[-1] == "tf_static"  # of several publishers, each with transforms of its own
+            latched = topic.latched or static
             qos = QoSProfile(
-                depth=100,
+                depth=1 if topic.latched and not static else 100,
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )

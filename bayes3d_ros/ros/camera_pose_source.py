@@ -162,7 +162,7 @@ class CameraPoseSource:
         pose = None if self._tf is None else self._tf.latest(stamp_ns, camera_frame, self._tolerance)
         if pose is not None:
             return CameraPose(pose, "tf")
-        if self._fixed is not None and not self.in_use(camera_frame):
+        if self._fixed is not None and not self.in_use(camera_frame) and not self._topic.other_type:
             return CameraPose(self._fixed, "parameter")  # also where a publisher of before has gone
         return CameraPose(None, "none", self._why_none(stamp_ns, camera_frame))
 

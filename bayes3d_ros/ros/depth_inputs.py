@@ -198,7 +198,8 @@ class DepthInputs:
     def _distorted(self) -> bool:
         """Whether images may need to be rectified. (Rectifiers may leave D as it was, but call their topic so.)"""
         info = self._queue.latest_info
-        return info is not None and any(abs(d) > 0 for d in info.d) and "rect" not in self._image_topic.topic
+        name = self._image_topic.topic.removesuffix("/compressedDepth").rpartition("/")[2]
+        return info is not None and any(abs(d) > 0 for d in info.d) and "rect" not in name
 
     def _pose_problem(self) -> str:
         if self._poses is None:

@@ -308,7 +308,8 @@ def judge_on_request(health: Health, view: InputView, *, idle: bool) -> tuple[by
         return WARN, f"no image for a request: {health.unusable}"
     good = "waiting for a request (~/parse)" if idle else "parsing on request"
     failure = health.failure()
-    told_of = [*input_warnings(view), *([f"the last request had no result: {failure}"] if failure else [])]
+    last = [f"the last request had no result: {failure}"] if failure else health.warnings()
+    told_of = [*input_warnings(view), *last]
     return (WARN, f"{good}; {'; '.join(told_of)}") if told_of else (OK, good)
 
 

@@ -14,10 +14,10 @@ from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSetting
 CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser
 
 
-def check_frame_name(setting: str, name: str) -> None:
+def check_frame_name(parameter: str, name: str) -> None:
     """Raise ValueError, in one line, for a name that tf2 refuses."""
     if name != plain_frame(name):
-        raise ValueError(f"{setting} must name a frame without a slash before it, as tf2 does, got {name!r}")
+        raise ValueError(f"{parameter} must name a frame without a slash before it, as tf2 does, got {name!r}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from bayes3d_ros.posterior.reframe import table_frame
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_pose_source import CameraPose
 from bayes3d_ros.ros.node_settings import SceneParserNodeSettings
-from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
+from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, plain_frame, tf_poses
 
 TABLE = "table"  # as output_frame: the table's frame, whatever `table_frame` calls it
 _TF_MEMORY = 60.0  # seconds: tf is asked when a frame is parsed, which may take longer than tf2's default of 10
@@ -55,7 +55,7 @@ class OutputFrames:
         a robot to the wrong place.
         """
         wanted, sigma = self._settings.output_frame, self._settings.camera_pose_sigma
-        if wanted in ("", posterior.frame_id):
+        if wanted in ("", plain_frame(posterior.frame_id)):
             return None
         if wanted in self._table_names:
             if posterior.table_found and pose.problem:

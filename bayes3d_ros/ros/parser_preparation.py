@@ -5,7 +5,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 from rclpy.lifecycle import Node
@@ -200,4 +200,5 @@ class ParserPreparation:
 
 def _compiled_alike(one: ParserSettings, other: ParserSettings) -> bool:
     """Whether a parser of one serves for the other: they differ in PER_FRAME settings alone."""
-    return replace(one, **{name: getattr(other, name) for name in PER_FRAME}) == other
+    compiled = [field.name for field in fields(ParserSettings) if field.name not in PER_FRAME]
+    return all(getattr(one, name) == getattr(other, name) for name in compiled)

@@ -149,13 +149,13 @@ class SceneParserNode(Node):
     def _on_prepared(self, seconds: float) -> None:
         """The worker has made a parser, or failed to."""
         state = self._state_label()
+        if state == "active" and self._ready is not None:  # also where the last of several failed
+            self._outputs.library(types_of(self._ready.parser))
         if self._parts.refusal:
             self.get_logger().error(self._parts.refusal)
             return
         self.get_logger().info(f"parser ready after {seconds:.1f} s")
-        if state == "active" and self._ready is not None:
-            self._outputs.library(types_of(self._ready.parser))
-        elif (
+        if (
             state == "unconfigured"
             and self.get_parameter("autostart").value
             and self.trigger_configure() == TransitionCallbackReturn.SUCCESS
@@ -279,7 +279,8 @@ class SceneParserNode(Node):
         latency = time.monotonic() - messages.arrived
         warnings = (*posterior.warnings, *([unplaced] if unplaced else []))
         health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
-        return ParseAnswer(True, found_words(told, ids))
+        words = found_words(told, ids)
+        return ParseAnswer(True, f"{words}; warning: {unplaced}" if unplaced else words)
 
     def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:
         """Compile for images of a frame's size, where that is needed, and say so."""

@@ -101,7 +101,8 @@ def commits(report: Report) -> str:
     """The commits at which it was measured, each once, and the first date."""
     runs = report.get("runs") or [{}]
     at = dict.fromkeys(_commit(run.get("commit")) for run in runs)
-    return f"{', '.join(at)}, {_date(runs[0].get('started')).split(' ')[0]}"
+    started = runs[0].get("started")
+    return f"{', '.join(at)}, {started[:10] if started else 'no date'}"
 
 
 def _commit(commit: str | None) -> str:

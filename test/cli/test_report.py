@@ -172,3 +172,13 @@ def test_the_overview_lists_every_experiment_and_what_was_missed(tmp_path: Path)
     ]
     others = set(EXPERIMENTS) - {"planted"}
     assert {name for name, cells in rows.items() if cells[-1] == "not run"} == others
+
+
+def test_the_overview_keeps_the_experiments_whose_pages_are_there(tmp_path: Path) -> None:
+    pages = tmp_path / "pages"
+    assert run(written(tmp_path, PLANTED), "--out", pages).exit_code == 0
+    other = PLANTED | {"experiment": "dial", "summary": {}, "runs": []}
+    assert run(written(tmp_path, other, "dial.json"), "--out", pages).exit_code == 0
+    rows = table((pages / "overview.md").read_text())
+    assert rows["[planted](planted.md)"][1] == "all met"
+    assert rows["[dial](dial.md)"][-1] == "not recorded, no date (quick)"

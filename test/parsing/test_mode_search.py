@@ -66,7 +66,29 @@ def test_turns_that_are_followed_are_the_best_of_each_type_and_then_those_that_g
     turns, _ = _best_turns(Hypotheses(start, jnp.tile(0.01 * jnp.eye(3), (2, 1, 1))), gains(start), gains, library)
     kept = np.asarray(turns.placement.type)
     assert len(kept) == 2 * SEARCH.turns_kept and (kept == 1).sum() == 1
-    yaws = np.sort(np.asarray(turns.placement.yaw)[kept == 0])
+    assert_apart(turns, kept == 0, peaks)
+
+
+def test_all_turns_are_those_of_the_only_type_where_there_is_but_one():
+    library = mug_and_brick()
+    peaks = np.array([0.5, 1.4, 2.3, 3.2, 4.1, 5.0])
+
+    def gains(at):
+        return -jnp.abs((at.yaw[:, None] - peaks + jnp.pi) % (2 * jnp.pi) - jnp.pi).min(1)
+
+    many = 10
+    start = Placement(
+        jnp.zeros(many, int), jnp.full(many, 5), jnp.zeros(many), jnp.zeros(many), jnp.linspace(0, 1, many)
+    )
+    scale = jnp.tile(0.01 * jnp.eye(3), (many, 1, 1))
+    turns, value = _best_turns(Hypotheses(start, scale), gains(start), gains, library)
+    real = np.isfinite(np.asarray(value))
+    assert real.sum() >= len(peaks) - 1  # the hypothesis itself stands at one of them
+    assert_apart(turns, real, peaks)
+
+
+def assert_apart(turns, which, peaks):
+    yaws = np.sort(np.asarray(turns.placement.yaw)[which])
     assert all(np.abs(yaw - peaks).min() <= np.pi / TURNED + 1e-3 for yaw in yaws)
     assert (np.diff(yaws) > 0.5).all()
 

@@ -72,6 +72,14 @@ def test_the_parameter_serves_again_when_a_publisher_has_gone(ros) -> None:
     poses.close()
 
 
+def test_the_parameter_does_not_serve_where_poses_of_another_type_are_published(ros) -> None:
+    poses = source(ros, 0.0, camera_pose=FIXED)
+    poses._topic.other_type = "it has type geometry_msgs/msg/Pose, expected geometry_msgs/msg/PoseStamped"
+    found = poses.find(10**9, "camera", last=True)
+    assert found is not None and found.source == "none" and found.problem.startswith("/camera_pose: it has type")
+    poses.close()
+
+
 def test_an_image_that_comes_seconds_after_its_stamp_has_its_pose(ros) -> None:
     poses = source(ros, 0.5)
     for k in range(100):  # ten seconds

@@ -136,6 +136,20 @@ def test_a_value_that_a_parameter_has_changes_nothing_and_takes_a_refusal_back(b
     assert bundle is not None and bundle.parser.settings.max_objects == 3
 
 
+def test_what_holds_from_one_image_to_the_next_may_have_changed_before(bench: Bench) -> None:
+    """Settings of before must not be mixed with those of now: they need not fit each other."""
+    bench.parameters = ParserSettings(max_objects=3)
+    assert not bench.preparation.begin()
+    bench.work()
+    bench.spin()
+    bench.parameters = ParserSettings(max_objects=8, fixed_objects=5)
+    assert not bench.preparation.adapt()
+    bench.work()
+    bench.spin()
+    bundle = bench.in_use.bundle
+    assert bundle is not None and bundle.parser.settings == bench.parameters
+
+
 def test_a_parser_that_could_not_be_made_is_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: object) -> None:
         raise RuntimeError("out of memory")
