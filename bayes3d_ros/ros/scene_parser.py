@@ -15,9 +15,7 @@ from std_srvs.srv import Trigger
 from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.objects.model import LibraryError
 from bayes3d_ros.parsing.parser import SceneParser
-from bayes3d_ros.posterior.collision_scene import check_frame
 from bayes3d_ros.posterior.object_ids import IdMemory, named
-from bayes3d_ros.posterior.reframe import in_frame
 from bayes3d_ros.posterior.types import ParseError
 from bayes3d_ros.ros.arguments import check_arguments
 from bayes3d_ros.ros.depth_inputs import DepthMessages
@@ -32,16 +30,12 @@ from bayes3d_ros.ros.node_settings import (
     SCENE_PARSER_SETTINGS,
     SceneParserNodeSettings,
 )
-from bayes3d_ros.ros.object_transforms import ObjectTransforms
-from bayes3d_ros.ros.output_frames import OutputFrames
 from bayes3d_ros.ros.parse_requests import ParseAnswer
 from bayes3d_ros.ros.parse_service import ParseService
 from bayes3d_ros.ros.parser_bundle import MakeParser, ParserBundle, types_of
 from bayes3d_ros.ros.parser_in_use import ParserInUse
 from bayes3d_ros.ros.parser_preparation import CANNOT_COMPILE, ParserPreparation
-from bayes3d_ros.ros.planning_scene import PlanningScenePublisher
-from bayes3d_ros.ros.publishers import ScenePublishers
-from bayes3d_ros.ros.scene_outputs import ToldScene
+from bayes3d_ros.ros.scene_outlets import SceneOutlets
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.ros.summary import found_words, key_values
 from bayes3d_ros.settings import PER_FRAME, ParserSettings
@@ -68,12 +62,9 @@ class SceneParserNode(Node):
         )
         self._in_use = ParserInUse()
         self._preparation = ParserPreparation(self, self._parts, self._in_use, make_parser, self._on_prepared)
-        self._frames: OutputFrames | None = None  # there while inputs are
-        self._transforms: ObjectTransforms | None = None  # from the first publish_tf on
-        self._planning: PlanningScenePublisher | None = None  # there while inputs are, with planning_scene
         self._opened: tuple[object, ...] = ()  # values of parameters that inputs were opened for
         self._ids = IdMemory()  # the worker's alone
-        self._outputs = ScenePublishers(self)
+        self._outlets = SceneOutlets(self)  # open while inputs are
         refuse_wrong_transitions(self)
         self._parse = ParseService(self, self._parse_timeout, self._why_not, self._why_late)
         self.create_service(Trigger, "~/reload_library", self._on_reload)
@@ -106,7 +97,7 @@ class SceneParserNode(Node):
         assert self._ready is not None
         result = super().on_activate(state)
         self._open_inputs()
-        self._outputs.library(types_of(self._ready.parser))
+        self._outlets.library(types_of(self._ready.parser))
         types = len(self._ready.parser.library.models)
         self.get_logger().info(f"active, {types} object types, inference on {self._ready.backend}")
         return result
@@ -150,7 +141,7 @@ class SceneParserNode(Node):
         """The worker has made a parser, or failed to."""
         state = self._state_label()
         if state == "active" and self._ready is not None:  # also where the last of several failed
-            self._outputs.library(types_of(self._ready.parser))
+            self._outlets.library(types_of(self._ready.parser))
         if self._parts.refusal:
             self.get_logger().error(self._parts.refusal)
             return
@@ -171,7 +162,7 @@ class SceneParserNode(Node):
     def _open_inputs(self) -> None:
         use_pose = {"depth": "no", "auto": "yes", "pose": "required"}[self._parts.settings.read(ParserSettings).table]
         self._opened = self._input_values()
-        self._open_frames()
+        self._outlets.open(self._parts.settings.in_use(SceneParserNodeSettings))
         self._parts.listen(self._on_image, use_pose)
         self._parts.health.begin()
 
@@ -182,29 +173,7 @@ class SceneParserNode(Node):
     def _close_inputs(self) -> None:
         self._parts.close_inputs()
         self._parts.worker.forget()
-        self._close_frames()
-
-    def _open_frames(self) -> None:
-        """Outputs as the parameters are now. A planner keeps its obstacles until the next scene replaces them."""
-        settings = self._parts.settings.in_use(SceneParserNodeSettings)
-        self._close_frames(publish_tf=settings.publish_tf, planning_scene=settings.planning_scene)
-        self._frames = OutputFrames(self, settings)
-        if settings.publish_tf:
-            self._transforms = self._transforms or ObjectTransforms(self)
-            self._transforms.resume()
-        if settings.planning_scene and self._planning is None:
-            self._planning = PlanningScenePublisher(self)
-
-    def _close_frames(self, *, publish_tf: bool = False, planning_scene: bool = False) -> None:
-        """Close the outputs that are not wanted, and those that hold only for the parameters that they began with."""
-        if self._frames is not None:
-            self._frames.close()
-            self._frames = None
-        if self._transforms is not None and not publish_tf:
-            self._transforms.pause()
-        if self._planning is not None and not planning_scene:
-            self._planning.close()
-            self._planning = None
+        self._outlets.close()
 
     def _why_not_set(self, parameters: list[Parameter]) -> str:
         """Why values may not be set now; empty where they may, as far as their types do not forbid it."""
@@ -226,7 +195,7 @@ class SceneParserNode(Node):
             self._parts.worker.forget()
             self._open_inputs()
         elif self._parts.inputs is not None and names & {*OUTPUT_FRAME_PARAMETERS}:
-            self._open_frames()
+            self._outlets.open(self._parts.settings.in_use(SceneParserNodeSettings))
 
     # Frames
 
@@ -253,9 +222,8 @@ class SceneParserNode(Node):
 
     def _parse_and_publish(self, messages: DepthMessages) -> ParseAnswer:
         """One frame from messages to messages, and what is told of it in one line."""
-        ready, health = self._ready, self._parts.health
-        frames, transforms, planning = self._frames, self._transforms, self._planning
-        if ready is None or frames is None:
+        ready, outlets, health = self._ready, self._outlets.now, self._parts.health
+        if ready is None or outlets is None:
             health.discard()
             return ParseAnswer(False, "the node was deactivated")
         try:
@@ -263,24 +231,18 @@ class SceneParserNode(Node):
             self._compile_for(frame, ready)
             with health.doing("parsing one frame", usual=QUIET):
                 posterior = ready.parser.parse(frame)
-            told = in_frame(posterior, frames.find(posterior, messages.pose, messages.arrived))
-            if planning is not None:
-                check_frame(told)
+            told = outlets.told(posterior, messages)
         except (ValueError, ParseError) as error:
             why = messages.pose.problem if ready.parser.settings.table == "pose" else ""
             return ParseAnswer(False, self._parts.problem(str(error), why))
         ids, self._ids = named(self._ids, told)
-        unplaced = frames.unplaced(posterior) if ready.parser.settings.table == "auto" else ""  # else it is wanted so
-        if transforms is not None and not unplaced:  # before messages that name the ids
-            transforms.send(told, ids)
-        if planning is not None:
-            planning.send(told, ids, ready.meshes)
-        self._outputs.scene(ToldScene(told, ids, ready.parser.library, ready.markers, frames.table_frame))
+        wanted = ready.parser.settings.table != "auto"  # that the table is that of the image, or of a pose
+        unplaced = "" if wanted else outlets.frames.unplaced(posterior)
+        outlets.send(told, ids, ready, to_tf=not unplaced)
         latency = time.monotonic() - messages.arrived
-        warnings = (*posterior.warnings, *([unplaced] if unplaced else []))
+        warnings = (*posterior.warnings, unplaced) if unplaced else posterior.warnings
         health.output(posterior.seconds, posterior.ess, latency, warnings, posterior.usable_share)
-        words = found_words(told, ids)
-        return ParseAnswer(True, f"{words}; warning: {unplaced}" if unplaced else words)
+        return ParseAnswer(True, found_words(told, ids, warnings))
 
     def _compile_for(self, frame: DepthFrame, ready: ParserBundle) -> None:
         """Compile for images of a frame's size, where that is needed, and say so."""

@@ -46,14 +46,14 @@ def summary_message(posterior: ScenePosterior, ids: Sequence[str] = ()) -> Diagn
     return DiagnosticArray(header=header(posterior), status=[scene, *objects])
 
 
-def found_words(posterior: ScenePosterior, ids: Sequence[str]) -> str:
+def found_words(posterior: ScenePosterior, ids: Sequence[str], warnings: Sequence[str]) -> str:
     """What was found in an image, in one line: its objects, by their ids, and what to be warned of."""
     listed = ", ".join(f"{name} (p {o.probability:.2f})" for name, o in zip(ids, posterior.objects, strict=True))
     count = len(posterior.objects)
     found = f"{count} object{'s' * (count != 1)}: {listed}" if count else "no object"
     seconds, nanoseconds = divmod(posterior.stamp_ns, 10**9)
     image = f"image of stamp {seconds}.{nanoseconds:09d}"
-    return "; ".join([f"{found}; {image}", *(f"warning: {warning}" for warning in posterior.warnings)])
+    return "; ".join([f"{found}; {image}", *(f"warning: {warning}" for warning in warnings)])
 
 
 def place_words(place: UnexplainedPlace) -> str:
