@@ -3,7 +3,7 @@
 """`bayes3d report`: pages of what `bayes3d evaluate` measured."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +64,7 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         copies |= {file.parent / picture: out / RESULTS / picture for picture in pictures}
     if not pages:
         raise InputError(f"{', '.join(map(str, reports))}: expected a finished experiment of `bayes3d evaluate`")
-    pages.append((out / OVERVIEW_PAGE, overview_page(_finished(out / RESULTS) | contents)))
+    pages.append((out / OVERVIEW_PAGE, overview_page(_finished(out / RESULTS, contents) | contents)))
     if answers_the_paper(contents):
         pages.append((out / PAPER_PAGE, paper_page(contents)))
     (out / RESULTS).mkdir(parents=True, exist_ok=True)
@@ -78,15 +78,16 @@ def report(reports: tuple[Path, ...], out: Path) -> None:
         click.echo(f"{path}")
 
 
-def _finished(results: Path) -> "dict[str, Report]":
-    """Finished reports of an earlier call, whose pages stay, by the names of their experiments."""
+def _finished(results: Path, others: Container[str]) -> "dict[str, Report]":
+    """Finished reports of an earlier call, whose pages stay, by the names of their experiments; not of `others`."""
+    from bayes3d_ros.validation.experiments import EXPERIMENTS
     from bayes3d_ros.validation.report import ReportError, read_report
 
     found = {}
-    for file, _ in _files([results] if results.is_dir() else []):
-        with suppress(ReportError):
-            content = read_report(file)
-            found[content["experiment"]] = content
+    for name in EXPERIMENTS:
+        if name not in others:
+            with suppress(ReportError, OSError):
+                found[name] = read_report(results / f"{name}.json")
     return found
 
 

@@ -8,6 +8,7 @@ infinity, zero and negative values are no return. In metres there is one mark fo
 
 import array
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -82,6 +83,13 @@ def encode_depth(
     rows = np.zeros((height, step), np.uint8)
     rows[:, :used] = np.ascontiguousarray(values).view(np.uint8).reshape(height, used)
     return rows.tobytes()
+
+
+def intrinsics_of(info: Any, image_size: tuple[int, int]) -> Intrinsics:
+    """`intrinsics_from_camera_info` of a message; rclpy's and rosbags' have the same fields."""
+    roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+    binning = info.binning_x, info.binning_y
+    return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, image_size, binning, roi)
 
 
 def intrinsics_from_camera_info(

@@ -62,7 +62,7 @@ class TransformTree:
 
     def add(self, parent: str, child: str, stamp_ns: int, T_parent_child: Transform, static: bool = False) -> None:
         """A transform; the stamp of a static one means nothing."""
-        parent, child = _plain(parent), _plain(child)
+        parent, child = plain_frame(parent), plain_frame(child)
         for one, other in ((parent, child), (child, parent)):
             self._neighbours.setdefault(one, set()).add(other)
         link = Link(parent, T_parent_child)
@@ -78,18 +78,18 @@ class TransformTree:
 
     def connects(self, a: str, b: str) -> bool:
         """Whether transforms lead from one frame to the other, at whatever stamps."""
-        reached, waiting = set(), [_plain(a)] if _plain(a) in self._neighbours else []
+        reached, waiting = set(), [plain_frame(a)] if plain_frame(a) in self._neighbours else []
         while waiting:
             frame = waiting.pop()
             if frame not in reached:
                 reached.add(frame)
                 waiting += self._neighbours[frame]
-        return _plain(b) in reached
+        return plain_frame(b) in reached
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform | None:
         """T_target_source at a stamp; None where a transform between them is not known then."""
-        of_source = self._ancestors(_plain(source), stamp_ns)
-        of_target = self._ancestors(_plain(target), stamp_ns)
+        of_source = self._ancestors(plain_frame(source), stamp_ns)
+        of_target = self._ancestors(plain_frame(target), stamp_ns)
         common = next((frame for frame in of_source if frame in of_target), None)
         return None if common is None else inverse_pose(of_target[common]) @ of_source[common]
 
@@ -109,5 +109,6 @@ class TransformTree:
         return self._static.get(frame) if track is None else track.at(stamp_ns)
 
 
-def _plain(frame: str) -> str:
-    return frame.lstrip("/")
+def plain_frame(name: str) -> str:
+    """A frame's name as tf2 has it: without the slash that names of ROS 1 begin with, which tf2 refuses."""
+    return name.lstrip("/")

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_of
 from bayes3d_ros.io.bag_contents import (
     COMPRESSED_IMAGE,
     STORE,
@@ -149,9 +149,7 @@ class FrameReader:
             return t != stamp, (info.width, info.height) != size, t > stamp, abs(t - stamp)
 
         info = min(self._infos, key=closeness)[1]
-        roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
-        binning = info.binning_x, info.binning_y
-        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, size, binning, roi)
+        return intrinsics_of(info, size)
 
 
 class BagWriter:

@@ -11,12 +11,13 @@ from geometry_msgs.msg import PoseStamped
 from jaxtyping import Float
 from rclpy.node import Node
 
+from bayes3d_ros.geometry.transform_tree import plain_frame
 from bayes3d_ros.ros.from_messages import matrix_from_values, pose_to_matrix, stamp_to_ns
 from bayes3d_ros.ros.input_topics import POSE_INPUT
 from bayes3d_ros.ros.node_settings import DepthInputSettings
 from bayes3d_ros.ros.pose_history import PoseHistory
 from bayes3d_ros.ros.subscriptions import AutoSubscription
-from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, plain_frame, tf_poses
+from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
 
 _HISTORY = 10.0  # seconds of poses that are kept beyond `patience`: as long as tf2 keeps transforms
 

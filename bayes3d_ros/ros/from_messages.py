@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from bayes3d_ros.geometry.camera import Intrinsics
 from bayes3d_ros.geometry.compressed_depth import decode_compressed_depth
 from bayes3d_ros.geometry.depth_frame import DepthFrame
-from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_from_camera_info
+from bayes3d_ros.geometry.depth_image import decode_depth, intrinsics_of
 from bayes3d_ros.geometry.poses import pose_matrix
 from bayes3d_ros.ros.to_messages import POINT_TYPES
 
@@ -38,9 +38,7 @@ class CameraInfoError(ValueError):
 def intrinsics_from_message(info: CameraInfo, width: int, height: int) -> Intrinsics:
     """The intrinsics of an image of this size. Raises CameraInfoError."""
     try:
-        roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
-        binning = info.binning_x, info.binning_y
-        return intrinsics_from_camera_info(info.k, info.p, info.width, info.height, (width, height), binning, roi)
+        return intrinsics_of(info, (width, height))
     except ValueError as error:
         raise CameraInfoError(str(error)) from None
 

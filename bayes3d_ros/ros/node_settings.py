@@ -4,11 +4,12 @@
 
 from dataclasses import dataclass, fields
 
+from bayes3d_ros.geometry.transform_tree import plain_frame
 from bayes3d_ros.learning.learn import LearningError, check_name
 from bayes3d_ros.ros.depth_transport import RAW, TRANSPORTS
 from bayes3d_ros.ros.from_messages import matrix_from_values
 from bayes3d_ros.ros.planning_scene import why_not
-from bayes3d_ros.ros.tf_poses import NO_TF, plain_frame, tf2_ros
+from bayes3d_ros.ros.tf_poses import NO_TF, tf2_ros
 from bayes3d_ros.settings import LearnerSettings, ParserSettings, TrackerSettings, setting, validate
 
 CONTINUOUS, ON_REQUEST = "continuous", "on_request"  # modes of scene_parser

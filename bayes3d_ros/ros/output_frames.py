@@ -9,12 +9,13 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from bayes3d_ros.geometry.poses import inverse_pose
+from bayes3d_ros.geometry.transform_tree import plain_frame
 from bayes3d_ros.posterior.output_frame import OutputFrame
 from bayes3d_ros.posterior.reframe import table_frame
 from bayes3d_ros.posterior.types import ScenePosterior
 from bayes3d_ros.ros.camera_pose_source import CameraPose
 from bayes3d_ros.ros.node_settings import SceneParserNodeSettings
-from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, plain_frame, tf_poses
+from bayes3d_ros.ros.tf_poses import NO_TF, TfPoses, tf_poses
 
 TABLE = "table"  # as output_frame: the table's frame, whatever `table_frame` calls it
 _TF_MEMORY = 60.0  # seconds: tf is asked when a frame is parsed, which may take longer than tf2's default of 10

@@ -105,7 +105,6 @@ class ParserPreparation:
         try:
             settings, size = self._parts.settings.read(ParserSettings), self._size()
             library = self._load(settings) if reload or not self._libraries else self._libraries[-1]
-            check_types(settings.types, library)
         except (ValueError, LibraryError) as error:
             if self._in_use.bundle is None:
                 self._parts.refuse(str(error))

@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 
+from bayes3d_ros.geometry.transform_tree import plain_frame
 from bayes3d_ros.ros.from_messages import stamp_to_ns, transform_to_matrix
 
 try:
@@ -23,11 +24,6 @@ except ImportError:
 NO_TF = "tf: tf2_ros is not installed"
 _JUMP = 1.0  # seconds backwards, after which tf is heard anew; of real time, in which that is done once
 _MEMORY = 10.0  # seconds, tf2's own default
-
-
-def plain_frame(name: str) -> str:
-    """A frame's name as tf2 has it: without the slash that names of ROS 1 begin with, which tf2 refuses."""
-    return name.removeprefix("/")
 
 
 def tf_poses(node: Node, frame: str, memory: float = _MEMORY) -> "TfPoses | None":

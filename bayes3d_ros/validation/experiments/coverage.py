@@ -55,14 +55,24 @@ SAME_THING_WITHIN = 0.1  # metres: an estimate farther off is another thing's
 RIGHT_REST_WITHIN = np.radians(10.0)  # samples tipped farther stand on another face
 # Quantities: x and y on the table; `range` and `across`, the same along and across the camera's view; then regions.
 COVERED_QUANTITIES = ("x", "y", "range", "across", "yaw", "position", "pose")
-LEAST_COVERED, MOST_COVERED, MOST_WIDE = 0.86, 0.94, 4.0  # of its 90 % regions: shares of truths, width in RMS errors
+COVERED = (0.86, 0.94)  # the least and the largest share of truths in 90 % regions
+MOST_WIDE = 4.0  # RMS errors: of a 90 % region
+
+
+def wanted_of_regions(quantity: str, covered: tuple[float, float]) -> dict[str, str]:
+    """What is wanted of a quantity of the summary, in words; `regions_met` says whether it is so."""
+    limits = {"coverage_90": f"{covered[0]:g} to {covered[1]:g}", "width_per_error": f"at most {MOST_WIDE:g}"}
+    return {f"{quantity}.{key}": limit for key, limit in limits.items()}
+
+
+def regions_met(value: Row, covered: tuple[float, float]) -> bool:
+    """Whether a quantity's regions are neither too narrow nor too wide. value: see `quantity`."""
+    narrow = value.get("width_per_error") is None or value["width_per_error"] <= MOST_WIDE
+    return covered[0] <= value["coverage_90"] <= covered[1] and narrow
+
+
 WANTED = {
-    f"{SHARED}: {name}.{key}": limit
-    for name in COVERED_QUANTITIES
-    for key, limit in (
-        ("coverage_90", f"{LEAST_COVERED:g} to {MOST_COVERED:g}"),
-        ("width_per_error", f"at most {MOST_WIDE:g}"),
-    )
+    key: limit for name in COVERED_QUANTITIES for key, limit in wanted_of_regions(f"{SHARED}: {name}", COVERED).items()
 }
 HEADER = (
     f"{'scene':>5} {'type':<20} {'model':<20} {'ESS':>5} {'rest':>5}  "
@@ -247,14 +257,8 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             able = [row for row in own if name not in ("yaw", "pose") or SYMMETRIES[row["type"]].has_yaw]
             if able:
                 told[f"{label}: {name}"] = quantity(name, able)
-    missed = [key for key, value in told.items() if key.startswith(f"{SHARED}: ") and not _met(value)]
-    return told | {"not_met": missed}
-
-
-def _met(value: Row) -> bool:
-    """Whether regions of a quantity are neither too narrow nor too wide."""
-    narrow = value.get("width_per_error") is None or value["width_per_error"] <= MOST_WIDE
-    return LEAST_COVERED <= value["coverage_90"] <= MOST_COVERED and narrow
+    regions = [key for key in told if key.startswith(f"{SHARED}: ")]
+    return told | {"not_met": [key for key in regions if not regions_met(told[key], COVERED)]}
 
 
 def quantity(name: str, rows: Sequence[Row]) -> Row:
