@@ -96,8 +96,12 @@ class SceneParserNode(Node):
         """Subscribe and publish."""
         assert self._ready is not None
         result = super().on_activate(state)
-        self._open_inputs()
-        self._outlets.library(types_of(self._ready.parser))
+        try:
+            self._open_inputs()
+            self._outlets.library(types_of(self._ready.parser))
+        except Exception as error:  # rclpy would go on to on_error without a word
+            self._parts.refuse(self._parts.failure("cannot activate", error))
+            return TransitionCallbackReturn.ERROR
         types = len(self._ready.parser.library.models)
         self.get_logger().info(f"active, {types} object types, inference on {self._ready.backend}")
         return result
@@ -120,6 +124,14 @@ class SceneParserNode(Node):
         self._preparation.forget()
         super().on_deactivate(state)  # rclpy leaves the publishers of an active node open
         return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """A transition failed halfway: back to the beginning, unconfigured."""
+        self._close_inputs()
+        self._parse.refuse_all("a transition of the node failed")
+        self._preparation.forget()
+        super().on_deactivate(state)  # as in on_shutdown
+        return super().on_error(state)
 
     def stop(self, timeout: float) -> bool:
         """Stop the worker; False if it is in the middle of something longer than `timeout` seconds."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] [--compiling S] --ros-args
-...`; seconds for every frame, and for the first one of every size."""
+"""The scene_parser node around a parser without a model: `fake_scene_parser.py [--seconds S] [--compiling S]
+[--subscribing why] --ros-args ...`; seconds for every frame, and for the first one of every size, and why the first
+subscriptions cannot be made."""
 
 import copy
 import sys
@@ -13,6 +14,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.poses import inverse_pose
 from bayes3d_ros.objects.model import Library
 from bayes3d_ros.posterior.types import ObjectEstimate, ParseError, ScenePosterior, SceneSamples
+from bayes3d_ros.ros.depth_node import InferenceParts
 from bayes3d_ros.ros.scene_parser import SceneParserNode
 from bayes3d_ros.ros.spinning import run_node
 from bayes3d_ros.settings import ParserSettings
@@ -83,8 +85,21 @@ class FakeParser:
         )
 
 
+def cannot_subscribe_once(why: str) -> None:
+    """The first time that a node of this process subscribes to images, that fails."""
+    listen = InferenceParts.listen
+
+    def fail(*_: object) -> None:
+        InferenceParts.listen = listen
+        raise RuntimeError(why)
+
+    InferenceParts.listen = fail
+
+
 if __name__ == "__main__":
     options = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=False))
     FakeParser.seconds = float(options.get("--seconds", 0))
     FakeParser.compiling = float(options.get("--compiling", 0))
+    if "--subscribing" in options:
+        cannot_subscribe_once(options["--subscribing"])
     sys.exit(run_node(lambda: SceneParserNode(FakeParser), sys.argv))

@@ -13,6 +13,7 @@ import pytest
 from camera_rig import INTRINSICS
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -231,6 +232,19 @@ def test_configure_is_refused_while_the_node_compiles_by_itself(ros, library_fol
     request.transition.id = 1
     assert not ros.call(ChangeState, f"{name}/change_state", request).success
     ros.wait_for(lambda: "configure is refused: the node compiles already" in process.output(), "the line")
+
+
+def test_an_activation_that_fails_is_told_and_leaves_the_node_unconfigured(ros, library_folder: Path) -> None:
+    name = "/failing/scene_parser"
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.start_parser(library_folder, "--subscribing", "no memory", namespace="/failing")
+    told = "cannot activate: RuntimeError: no memory"
+    assert ros.wait_for_diagnosis(diagnostics, told, f"{name}: scene parsing").status[0].level == ERROR
+    assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == "unconfigured"
+    for transition in (1, 3):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert ros.call(ChangeState, f"{name}/change_state", request).success
+    ros.wait_for_diagnosis(diagnostics, "no publisher on /failing/depth/image_rect", f"{name}: scene parsing")
 
 
 def test_a_topic_of_another_type_is_named(ros, library_folder: Path) -> None:
