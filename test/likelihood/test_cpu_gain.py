@@ -106,16 +106,6 @@ def test_exponentials_and_logarithms():
     np.testing.assert_allclose([windows.log(v) for v in x], np.log(x.astype(float)), rtol=1e-6, atol=3e-7)
 
 
-@pytest.mark.parametrize("p", [2e-4, 0.1, 0.9])
-def test_sums_of_logs_of_the_largest_and_the_smallest_odds(p):
-    """The largest: sigma 0.1 mm, a return 0.2 m away, and far 100 m."""
-    odds = np.float32(np.geomspace(1e-20, 3e10, windows.WINDOWS_SIDE_BY_SIDE))
-    expected = np.log(p + (1 - p) * odds.astype(float)).sum()
-    assert windows.sum_of_logs(np.float32(p), odds, 0) == pytest.approx(expected, rel=1e-5)
-    most = np.full_like(odds, 3e10)
-    assert windows.sum_of_logs(np.float32(p), most, 0) == pytest.approx(len(odds) * np.log((1 - p) * 3e10), rel=1e-6)
-
-
 @pytest.mark.parametrize("permutes", [True, False])
 @pytest.mark.parametrize("kind", [np.float32, np.int32])
 def test_packing(permutes, kind, monkeypatch):

@@ -300,10 +300,8 @@ def mixtures(image, stride, border, picture, sigma, windows, count, odds):
 
 @fast
 def sum_of_logs(p, odds, at):
-    """Sum over pixels of log(p + (1 - p) odds), through the logs of products of four. Odds may be up to 4e12: each
-    factor is taken 2^-10 times, which rounds nothing."""
-    total, rest = f32(WINDOWS_SIDE_BY_SIDE * 10 * np.log(2)), (f32(1.0) - p) * f32(2.0**-10)
-    p = p * f32(2.0**-10)
+    """Sum over pixels of log(p + (1 - p) odds), through the logs of products of four."""
+    total, rest = f32(0.0), f32(1.0) - p
     at, quarter = u64(at), u64(WINDOWS_SIDE_BY_SIDE // 4)
     for k in range(quarter):
         product = (p + rest * odds[at + k]) * (p + rest * odds[at + k + quarter])
