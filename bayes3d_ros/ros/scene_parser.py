@@ -119,19 +119,20 @@ class SceneParserNode(Node):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening, for good."""
-        self._close_inputs()
-        self._parse.refuse_all("the node was shut down")
-        self._preparation.forget()
-        super().on_deactivate(state)  # rclpy leaves the publishers of an active node open
+        self._end_all(state, "the node was shut down")
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """A transition failed halfway: back to the beginning, unconfigured."""
-        self._close_inputs()
-        self._parse.refuse_all("a transition of the node failed")
-        self._preparation.forget()
-        super().on_deactivate(state)  # as in on_shutdown
+        self._end_all(state, "a transition of the node failed")
         return super().on_error(state)
+
+    def _end_all(self, state: LifecycleState, why: str) -> None:
+        """Leave nothing of any state; callers of ~/parse are told why."""
+        self._close_inputs()
+        self._parse.refuse_all(why)
+        self._preparation.forget()
+        super().on_deactivate(state)  # rclpy leaves the publishers of an active node open
 
     def stop(self, timeout: float) -> bool:
         """Stop the worker; False if it is in the middle of something longer than `timeout` seconds."""

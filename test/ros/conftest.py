@@ -13,6 +13,8 @@ import pytest
 import rclpy
 import trimesh
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -88,6 +90,11 @@ class Ros:
         self.wait_for(future.done, f"the answer of {name}")
         self.node.destroy_client(client)
         return future.result()
+
+    def change_state(self, node: str, transition: int) -> bool:
+        """Whether a node made a transition of its lifecycle; by its number."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self.call(ChangeState, f"{node}/change_state", request).success
 
     def ask(self, kind: Any, name: str, request: Any) -> tuple[Client, Future]:
         """Call a service without waiting for its answer."""

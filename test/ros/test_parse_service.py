@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -70,9 +70,7 @@ class Robot:
         assert self.ros.call(SetParameters, "/scene_parser/set_parameters", request).results[0].successful
 
     def change_state(self, transition: int) -> None:
-        request = ChangeState.Request()
-        request.transition.id = transition
-        assert self.ros.call(ChangeState, "/scene_parser/change_state", request).success
+        assert self.ros.change_state("/scene_parser", transition)
 
 
 def stamp_of(answer: Trigger.Response) -> int:

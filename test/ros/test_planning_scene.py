@@ -13,7 +13,6 @@ from builtin_interfaces.msg import Time
 from camera_rig import INTRINSICS
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from moveit_messages import moveit_messages
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header, String
@@ -171,8 +170,7 @@ def test_the_node_removes_its_own_objects_when_it_is_deactivated(ros, library_fo
     ros.wait_for(lambda: ros.node.count_publishers("/scene_parser/planning_scene"), "the planning scene's publisher")
     camera.publish(DepthFrame(np.full((48, 64), 0.8, np.float32), INTRINSICS, 10**9, "camera"))
     ros.wait_for(lambda: heard, "a planning scene")
-    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    assert ros.call(ChangeState, "/scene_parser/change_state", request).success
+    assert ros.change_state("/scene_parser", Transition.TRANSITION_DEACTIVATE)
     ros.wait_for(lambda: len(heard) == 2, "the removal")
     assert [json.loads(told.data) for told in heard] == [
         [[ADD, "brick_1", "table", 1]],

@@ -204,9 +204,7 @@ def test_a_parameter_cannot_be_deleted(bench: Bench, name: str) -> None:
 
 @pytest.mark.parametrize("transition", [1, 3, 2, 99], ids=["configure", "activate", "cleanup", "unknown"])
 def test_a_transition_that_does_not_fit_the_state_is_refused(bench: Bench, transition: int) -> None:
-    request = ChangeState.Request()
-    request.transition.id = transition
-    assert not bench.ros.call(ChangeState, "/scene_parser/change_state", request).success
+    assert not bench.ros.change_state("/scene_parser", transition)
     bench.good_frame_is_parsed()
 
 
@@ -214,8 +212,7 @@ def test_configure_by_request_reports_while_it_compiles(ros, library_folder: Pat
     name = "/managed/scene_parser"
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     ros.start_parser(library_folder, "--compiling", "15", namespace="/managed", autostart=False)
-    request = ChangeState.Request()
-    request.transition.id = 1
+    request = ChangeState.Request(transition=Transition(id=1))
     client, future = ros.ask(ChangeState, f"{name}/change_state", request)
     ros.wait_for_diagnosis(diagnostics, "compiling for the library, ", f"{name}: scene parsing")
     assert not future.done()
@@ -228,9 +225,7 @@ def test_configure_is_refused_while_the_node_compiles_by_itself(ros, library_fol
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     process = ros.start_parser(library_folder, "--compiling", "15", namespace="/hasty")
     ros.wait_for_diagnosis(diagnostics, "compiling for the library, ", f"{name}: scene parsing")
-    request = ChangeState.Request()
-    request.transition.id = 1
-    assert not ros.call(ChangeState, f"{name}/change_state", request).success
+    assert not ros.change_state(name, 1)
     ros.wait_for(lambda: "configure is refused: the node compiles already" in process.output(), "the line")
 
 
@@ -241,9 +236,7 @@ def test_an_activation_that_fails_is_told_and_leaves_the_node_unconfigured(ros, 
     told = "cannot activate: RuntimeError: no memory"
     assert ros.wait_for_diagnosis(diagnostics, told, f"{name}: scene parsing").status[0].level == ERROR
     assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == "unconfigured"
-    for transition in (1, 3):
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert ros.call(ChangeState, f"{name}/change_state", request).success
+    assert ros.change_state(name, 1) and ros.change_state(name, 3)
     ros.wait_for_diagnosis(diagnostics, "no publisher on /failing/depth/image_rect", f"{name}: scene parsing")
 
 
@@ -343,11 +336,8 @@ def test_a_library_that_cannot_be_used_is_named_and_can_be_put_right(ros, librar
     ros.wait_for(lambda: names[-1].data == "brick\nunknown", "the smaller library")
 
     # A lifecycle manager can stop it and start it again.
-    change = f"{name}/change_state"
     for transition, label in ((4, "inactive"), (2, "unconfigured"), (1, "inactive"), (3, "active")):
-        request = ChangeState.Request()
-        request.transition.id = transition
-        assert ros.call(ChangeState, change, request).success
+        assert ros.change_state(name, transition)
         assert ros.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label == label
     ros.wait_for_diagnosis(diagnostics, "no publisher on /late/depth/image_rect", mine)
 
