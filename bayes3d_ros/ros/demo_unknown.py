@@ -44,6 +44,9 @@ NEW_NAME = "my_drill"  # what the third thing, a power drill, is learned as
 VOXEL_SIZE = 0.005
 KNOWN_WITHIN, SAME_PLACE = 0.01, 0.05  # metres: ADD-S of the known objects; of the third one, between two tellings
 SERVICE_SECONDS = 60.0
+# Seconds that an image waits for its pose: without one, a frame's table has another origin, and places cannot be
+# compared. Messages of a busy machine are late.
+PATIENCE = 10.0
 AGAIN_SECONDS = 5.0  # a frame is published again if it has not come by then: DDS may connect late
 TELL_SECONDS = 20.0  # between two lines about what scene_parser does meanwhile
 _LEARNER = "/object_learner: object learning"
@@ -97,10 +100,11 @@ class DemoTable:
         }
         height, width = self.frames[0].depth.shape
         self._processes: dict[str, NodeProcess] = {}
+        both = {"library": library, "patience": PATIENCE}
         size = {"warm_up_width": width, "warm_up_height": height}
-        self._start("scene_parser", out, library=library, **size)
+        self._start("scene_parser", out, **both, **size)
         learner = {"object_name": NEW_NAME, "voxel_size": VOXEL_SIZE, "max_age": 600.0}
-        self._start("object_learner", out, library=library, **learner)
+        self._start("object_learner", out, **both, **learner)
 
     def __enter__(self) -> "DemoTable":
         return self
