@@ -148,6 +148,20 @@ def test_looks_tell_how_the_losses_fell(halves):
     assert min(look.validation_loss for look in trained.looks) == trained.validation_loss
 
 
+def test_after_a_trial_only_the_best_learning_rate_goes_on(halves, monkeypatch):
+    images, side = halves
+    network = DepthNetwork(PLAN, images.shape[1:], 2, jax.random.key(0))
+    plan = QUICK._replace(rates=(1e-6, 1e-2), trial=20, patience=1000)
+    taken, step = [], training._step
+    monkeypatch.setattr(training, "_step", lambda *args: (taken.append(float(args[3])), step(*args))[1])
+    both = training.train_best(network, images, side, LOSS, plan, seed=3)
+    falls = (1 + np.cos(np.pi * np.arange(60) / 60)) / 2
+    np.testing.assert_allclose(taken, [*1e-6 * falls[:20], *1e-2 * falls], rtol=1e-6)
+    alone = training.train_best(network, images, side, LOSS, plan._replace(rates=(1e-2,)), seed=3)
+    assert both.rate == 1e-2 and both._replace(network=None, seconds=0) == alone._replace(network=None, seconds=0)
+    np.testing.assert_array_equal(*(training.predictions(one.network, images) for one in (both, alone)))
+
+
 def test_an_ensemble_has_members_of_its_own_and_augmentation_other_images(halves):
     images, side = halves
     short = QUICK._replace(most_steps=20)

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Training with early stopping on images held out, at several learning rates of which the best is kept.
+"""Training with early stopping on images held out, at the best of several learning rates.
+
+The learning rate falls along half a cosine (Loshchilov and Hutter 2017). Every rate is tried for a quarter of the
+steps; the one with the least loss of images held out goes on (successive halving, Jamieson and Talwalkar 2016).
 
 Where images are few, a fifth of them says little: each fifth is then held out in turn, which chooses the learning rate
 and the number of steps, and the network that is kept is trained so on all of them."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import count, islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,9 +31,10 @@ _PREDICTED = 128  # images at once: one shape is compiled for sets of all sizes
 class TrainingPlan(NamedTuple):
     """How long and how fast."""
 
-    rates: tuple[float, ...] = (3e-4, 1e-3, 3e-3)  # of AdamW
+    rates: tuple[float, ...] = (3e-4, 1e-3, 3e-3)  # of AdamW, at the first step
     batch: int = 64
-    most_steps: int = 8000
+    most_steps: int = 4000  # the learning rate is zero after so many
+    trial: int = 1000  # steps at every rate
     look_every: int = 10  # steps between looks at the images held out; a tenth of the steps so far, if these are more
     patience: int = 300  # steps without a better loss, after which training stops; as many as the best took, if more
     validation: float = 0.2  # share of the images that is held out
@@ -60,7 +64,7 @@ class Trained(NamedTuple):
     validation_loss: float
     seconds: float  # of all learning rates
     looks: tuple[Look, ...] = ()  # at the learning rate that was chosen
-    capped: bool = False  # whether `most_steps` ended the training, at this rate
+    capped: bool = False  # whether `most_steps` ended the training
 
 
 class Method(NamedTuple):
@@ -83,7 +87,7 @@ def train_best(
     plan: TrainingPlan,
     seed: int,
 ) -> Trained:
-    """Train from the same start at every learning rate. The same arguments give the same network on one machine.
+    """Train from the same start at the learning rates. The same arguments give the same network on one machine.
 
     The order of the images has to be random: the last ones are held out. Raises ValueError where there are fewer than
     two images.
@@ -93,8 +97,10 @@ def train_best(
     start = time.perf_counter()
     held_out = _held_out(len(images), plan)
     method = Method(loss, plan.decay)
-    tried = [_train(network, (images, targets), held_out, method, plan, rate, seed) for rate in plan.rates]
-    best = min(tried, key=lambda one: one.validation_loss)
+    runs = [_training(network, (images, targets), held_out, method, plan, rate, seed) for rate in plan.rates]
+    tried = [_advanced(run, plan.trial) for run in runs]
+    best, run = min(zip(tried, runs, strict=True), key=lambda one: one[0].validation_loss)
+    best = _advanced(run, plan.most_steps, best)
     if len(held_out) > 1:
         kept = np.arange(len(images))
         if best.steps:
@@ -135,7 +141,16 @@ def mean_loss(network: DepthNetwork, images: np.ndarray, targets: np.ndarray, lo
     return float(np.mean(np.asarray(loss(jnp.asarray(predictions(network, images)), jnp.asarray(targets)))))
 
 
-def _train(
+def _advanced(run: Iterator[Trained], step: int, now: Trained | None = None) -> Trained:
+    """How far a training has come after so many steps, or at its end. now: how far it has come."""
+    for now in run:
+        if now.looks[-1].step >= step:
+            break
+    assert now is not None, "a training has at least one look"
+    return now
+
+
+def _training(
     network: DepthNetwork,
     labelled: LabelledImages,
     held_out: Sequence[Int[np.ndarray, "H"]],
@@ -143,9 +158,9 @@ def _train(
     plan: TrainingPlan,
     rate: float,
     seed: int,
-) -> Trained:
-    """At one learning rate. Where several parts are held out in turn, a network for each takes its steps beside the
-    others, looks are at all together, and the network that is returned is the first one's."""
+) -> Iterator[Trained]:
+    """The best so far, at one learning rate, after every look. Where several parts are held out in turn, a network for
+    each takes its steps beside the others, looks are at all together, and the network is the first one's."""
     images, targets = labelled
     runs = []
     for part in held_out:
@@ -158,7 +173,6 @@ def _train(
         return total / sum(map(len, held_out))
 
     best = Trained(network, rate, 0, np.nan, validation_loss([network] * len(runs)), 0.0)
-    looks: list[Look] = []
     losses: list[Array] = []
     next_look = plan.look_every
     for step in range(1, plan.most_steps + 1):
@@ -167,13 +181,15 @@ def _train(
         if step < next_look and step < plan.most_steps:
             continue
         now = validation_loss(networks)
-        looks.append(Look(step, float(np.mean(jax.device_get(losses))), now))
+        look = Look(step, float(np.mean(jax.device_get(losses))), now)
         losses, next_look = [], step + max(plan.look_every, step // 10)
         if now < best.validation_loss:
             best = best._replace(network=networks[0], steps=step, validation_loss=now)
-        if step - best.steps >= max(plan.patience, best.steps) or not np.isfinite(now):
-            return best._replace(looks=tuple(looks))
-    return best._replace(looks=tuple(looks), capped=True)
+        stopped = step - best.steps >= max(plan.patience, best.steps) or not np.isfinite(now)
+        best = best._replace(looks=(*best.looks, look), capped=step == plan.most_steps and not stopped)
+        yield best
+        if stopped:
+            return
 
 
 def _steps(
@@ -184,11 +200,12 @@ def _steps(
     images, targets = labelled
     state = method.adam.init(eqx.filter(network, eqx.is_inexact_array))
     rng, changes = np.random.default_rng(seed), np.random.default_rng((seed, 1))
-    while True:
+    for step in count():
         drawn = rng.integers(len(images), size=plan.batch)
         seen = images[drawn] if plan.augmentation is None else augmented(images[drawn], plan.augmentation, changes)
         batch = jnp.asarray(seen), jnp.asarray(targets[drawn])
-        network, state, mean = _step(network, state, batch, jnp.float32(rate), method)
+        now = rate * (1 + np.cos(np.pi * min(step / plan.most_steps, 1))) / 2
+        network, state, mean = _step(network, state, batch, jnp.float32(now), method)
         yield network, mean
 
 
