@@ -177,6 +177,8 @@ def test_an_ensemble_has_members_of_its_own_and_augmentation_other_images(halves
     for key in ("parameters", "file_bytes", "memory_bytes"):
         assert told[key] == 3 * of_one[key]
     assert members[1].rate == members[2].rate == plain.rate
+    again = train_variant(Variant(PLAN, members=3), images, side, 2, LOSS, short, seed=1, first=plain)
+    np.testing.assert_array_equal(predictions_of(again, images), said)
     assert told["looks"] == of_one["looks"] and [step for step, *_ in told["looks"]] == [10, 20]
     (changed,) = trained(Variant(PLAN, augmentation=Augmentation(1, 0.1, 0.1, 0.1)))
     assert changed.looks[0].training_loss != plain.looks[0].training_loss

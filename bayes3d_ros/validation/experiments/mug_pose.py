@@ -22,7 +22,7 @@ fell while they were trained.
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -57,6 +57,9 @@ from bayes3d_ros.validation.simulate.mug_images import (
     mug_view,
     upright_mug,
 )
+
+if TYPE_CHECKING:  # of an extra that need not be installed
+    from bayes3d_ros.validation.networks.training import Trained
 
 __all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -145,8 +148,9 @@ def steps(quick: bool) -> Iterator[Step]:
     known = cache(partial(known_mug, mug))
     most = max(step.images for step in networks)
     images = cache(lambda: mug_images(mug(), TRAINED, most, (TRAINING_SEED,)))
+    alone: "dict[tuple[str, int], Trained]" = {}
     for step in networks:
-        yield partial(_network_rows, step, images, partial(_all_groups, truth, groups), quick)
+        yield partial(_network_rows, step, images, partial(_all_groups, truth, groups), alone, quick)
     for group in range(groups):
         for parser in parsers:
             yield partial(parser_rows, parser, group, truth, known)
@@ -160,9 +164,11 @@ def _network_rows(
     step: NetworkStep,
     images: Callable[[], MugImages],
     tests: Callable[[str], list[Truth]],
+    alone: "dict[tuple[str, int], Trained]",
     quick: bool,
 ) -> list[Row]:
-    """A row a condition, of a network trained on so many images."""
+    """A row a condition, of a network trained on so many images. alone: plain networks by size and number of images,
+    from which an ensemble takes its first member."""
     from bayes3d_ros.validation.networks.models import NetworkPlan
     from bayes3d_ros.validation.networks.training import QUICK_PLAN, TrainingPlan
     from bayes3d_ros.validation.networks.variants import Variant, predictions_of, train_variant, training_told
@@ -171,7 +177,13 @@ def _network_rows(
     variant = {"": plain, AUGMENTED: plain._replace(augmentation=AUGMENTATION), ENSEMBLE: plain._replace(members=5)}
     depth, yaw = SCALE.as_input(every.depth[: step.images]), every.yaw[: step.images].astype(np.float32)
     plan = QUICK_PLAN if quick else TrainingPlan()
-    members = train_variant(variant[step.kind], depth, yaw, 2, von_mises.output_loss, plan, seed=step.images)
+    own = step.size, step.images
+    first = alone.get(own) if step.kind == ENSEMBLE else None
+    members = train_variant(
+        variant[step.kind], depth, yaw, 2, von_mises.output_loss, plan, seed=step.images, first=first
+    )
+    if not step.kind:
+        alone[own] = members[0]
     told = training_told(members)
     rows = []
     for condition in MUG_CONDITIONS:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -47,6 +47,9 @@ from bayes3d_ros.validation.simulate.occluded_images import (
 from bayes3d_ros.validation.simulate.scene_file import find_mesh
 from bayes3d_ros.validation.statistics.model_sizes import ModelSizes, model_sizes
 from bayes3d_ros.validation.statistics.reliability import LEAST_PROBABILITY, binary_scores
+
+if TYPE_CHECKING:  # of an extra that need not be installed
+    from bayes3d_ros.validation.networks.training import Trained
 
 __all__ = ["HEADER", "WANTED", "count", "line", "notes", "plot", "steps", "summary"]
 
@@ -106,8 +109,9 @@ def steps(quick: bool) -> Iterator[Step]:
     training = cache(lambda: occluded_images(things(), SPREADS["as trained"], most, (TRAINING_SEED,)))
     parser = cache(_warm_parser)
     sizes = cache(lambda: model_sizes(parser().library))
+    alone: "dict[int, Trained]" = {}
     for name, size in _networks(quick):
-        yield partial(_network_rows, name, size, training, tests, quick)
+        yield partial(_network_rows, name, size, training, tests, alone, quick)
     for first in range(0, tested, AT_ONCE):
         for kind in SPREADS:
             yield partial(_parser_rows, kind, slice(first, min(first + AT_ONCE, tested)), tests, parser, sizes)
@@ -141,9 +145,11 @@ def _network_rows(
     size: int,
     training: Callable[[], OccludedImages],
     tests: Callable[[str], OccludedImages],
+    alone: "dict[int, Trained]",
     quick: bool,
 ) -> list[Row]:
-    """A row a kind of test images, of the network trained on so many."""
+    """A row a kind of test images, of the network trained on so many. alone: plain networks by number of images, from
+    which an ensemble takes its first member."""
     import optax
 
     from bayes3d_ros.validation.networks.models import NetworkPlan
@@ -161,7 +167,10 @@ def _network_rows(
     images, kinds = SCALE.as_input(every.depth[:size]), every.kind[:size]
     plan = QUICK_PLAN if quick else TrainingPlan()
     loss = optax.softmax_cross_entropy_with_integer_labels
-    members = train_variant(variant, images, kinds, 2, loss, plan, seed=size)
+    first = alone.get(size) if name == ENSEMBLE else None
+    members = train_variant(variant, images, kinds, 2, loss, plan, seed=size, first=first)
+    if name == NETWORK:
+        alone[size] = members[0]
     told = training_told(members)
     rows = []
     for kind in SPREADS:

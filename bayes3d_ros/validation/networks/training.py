@@ -32,7 +32,7 @@ class TrainingPlan(NamedTuple):
     """How long and how fast."""
 
     rates: tuple[float, ...] = (3e-4, 1e-3, 3e-3)  # of AdamW, at the first step
-    batch: int = 64
+    batch: int = 64  # images of a step; of fewer images the largest power of two that they make
     most_steps: int = 4000  # the learning rate is zero after so many
     trial: int = 1000  # steps at every rate
     look_every: int = 10  # steps between looks at the images held out; a tenth of the steps so far, if these are more
@@ -196,12 +196,13 @@ def _steps(
     network: DepthNetwork, labelled: LabelledImages, method: Method, plan: TrainingPlan, rate: float, seed: int
 ) -> Iterator[tuple[DepthNetwork, Array]]:
     """The network after each step, and the mean loss of the step's images before it. Images are drawn with
-    replacement: one shape is compiled for sets of all sizes."""
+    replacement."""
     images, targets = labelled
+    batch_size = min(plan.batch, 2 ** int(np.log2(len(images))))
     state = method.adam.init(eqx.filter(network, eqx.is_inexact_array))
     rng, changes = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     for step in count():
-        drawn = rng.integers(len(images), size=plan.batch)
+        drawn = rng.integers(len(images), size=batch_size)
         seen = images[drawn] if plan.augmentation is None else augmented(images[drawn], plan.augmentation, changes)
         batch = jnp.asarray(seen), jnp.asarray(targets[drawn])
         now = rate * (1 + np.cos(np.pi * min(step / plan.most_steps, 1))) / 2

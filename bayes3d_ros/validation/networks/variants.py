@@ -31,11 +31,15 @@ def train_variant(
     loss: Loss,
     plan: TrainingPlan,
     seed: int,
+    first: Trained | None = None,
 ) -> list[Trained]:
-    """Its members, each as `train_best` trains it; the first chooses the learning rate of all."""
+    """Its members, each as `train_best` trains it; the first chooses the learning rate of all. first: that member,
+    where it is trained already (the only one of a variant that differs in `members` alone)."""
     plan = plan._replace(augmentation=variant.augmentation)
     members: list[Trained] = []
-    for k in range(variant.members):
+    if first is not None:
+        members, plan = [first], plan._replace(rates=(first.rate,))
+    for k in range(len(members), variant.members):
         network = DepthNetwork(variant.network, images.shape[1:], outputs, jax.random.key(k))
         members.append(train_best(network, images, targets, loss, plan, seed + 1000 * k))
         plan = plan._replace(rates=(members[0].rate,))
