@@ -21,10 +21,21 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.planes import Patches, fit_planes
 from bayes3d_ros.geometry.voxel_grid import VoxelGrid
-from bayes3d_ros.geometry.voxels import VoxelSolid
-from bayes3d_ros.learning.fusion_constants import BEHIND_VOXEL, FEWEST_VOXELS, FOOT, GLIMPSE, HIT, LOW, PASS, THIN
+from bayes3d_ros.geometry.voxels import VoxelSolid, two_planes
+from bayes3d_ros.learning.fusion_constants import (
+    BEHIND_VOXEL,
+    FEWEST_VOXELS,
+    FOOT,
+    GLIMPSE,
+    HIT,
+    LOW,
+    PASS,
+    THIN,
+)
 from bayes3d_ros.learning.segment import Surface
+from bayes3d_ros.learning.smooth import smooth
 from bayes3d_ros.learning.tuning import TUNING
+from bayes3d_ros.learning.unseen import continued, down_to_table, nearest_planes, unseen_surface
 
 
 class Fused(NamedTuple):
@@ -49,6 +60,7 @@ class Seen(NamedTuple):
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
+    views = _smoothed(views, voxel_size)
     grid = _grid([view.surface for view in views], voxel_size)
     centres = grid.centres()
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
@@ -66,23 +78,37 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     area = voxel_size**2 / float(np.median(np.unique(index, return_counts=True)[1]))
     patches = fit_planes(SurfaceSamples(points, normals, area), grid)
     noise = _noise_of_a_neighbour(patches, grid)
-    voxel = patches.voxel[~noise]
+    clear = Patches(*(part[~noise] for part in patches))
+    walls = down_to_table(clear, grid)
     seen, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
-    seen[tuple(voxel.T)] = True
+    for part in (clear, walls):
+        seen[tuple(part.voxel.T)] = True
     # Where noise was dropped the plane next door decides; behind it is solid.
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
-    centre = grid.origin + (voxel + 0.5) * voxel_size
-    hull = _hull(centre + patches.normal[~noise] * patches.offset[~noise, None])  # points would count with their noise
+    centre = grid.origin + (clear.voxel + 0.5) * voxel_size
+    hull = _hull(centre + clear.normal * clear.offset[:, None])  # points would count with their noise
     unknown = (hits + glimpses == 0) & _within(hull, grid)
+    where = np.argwhere(unknown)
+    unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
     solid = _pieces(seen | behind | unknown)
-    unseen = _unseen_surface(solid, seen)
-    counts = np.concatenate([hits[tuple(voxel.T)], np.zeros(len(unseen.voxel), int)])
-    voxel = np.concatenate([voxel, unseen.voxel])
-    normal = np.concatenate([patches.normal[~noise], unseen.normal])
-    offset = np.concatenate([patches.offset[~noise], np.zeros(len(unseen.voxel))])
+    unseen = continued(unseen_surface(solid, seen), clear, grid)
+    counts = hits[tuple(clear.voxel.T)]
+    clear, second = two_planes(SurfaceSamples(points, normals, area), clear, grid, oriented=True)
+    counts = np.concatenate([counts, np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
+    voxel, normal, offset = (
+        np.concatenate([getattr(part, key) for part in (clear, walls, unseen)]) for key in ("voxel", "normal", "offset")
+    )
     order = np.argsort(grid.flat(voxel))
-    surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order])
+    surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order], *second)
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
+
+
+def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:
+    """What all views show together, without the noise of single pixels."""
+    every = Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
+    ends = np.cumsum([len(view.surface.points) for view in views])[:-1]
+    parts = zip(*(np.split(part, ends) for part in smooth(every, voxel_size)), strict=True)
+    return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)]
 
 
 def _grid(surfaces: Sequence[Surface], voxel_size: float) -> VoxelGrid:
@@ -182,23 +208,3 @@ def _within(hull: ConvexHull, grid: VoxelGrid) -> Bool[np.ndarray, "X Y Z"]:
         else:
             low = np.maximum(low, -outside / plane[2])
     return (z >= low[..., None]) & (z <= high[..., None])
-
-
-class _Unseen(NamedTuple):
-    """Planes go through the voxels' middles."""
-
-    voxel: Int[np.ndarray, "U 3"]
-    normal: Float[np.ndarray, "U 3"]
-
-
-def _unseen_surface(solid: Bool[np.ndarray, "X Y Z"], seen: Bool[np.ndarray, "X Y Z"]) -> _Unseen:
-    """Voxels of the solid's rim that no view saw, with planes through their middles: on the table straight down."""
-    padded = np.pad(solid, 1)
-    rim = solid & ~ndimage.binary_erosion(padded)[1:-1, 1:-1, 1:-1] & ~seen
-    voxel = np.argwhere(rim)
-    smooth = ndimage.gaussian_filter(padded.astype(np.float32), 1.0)
-    slope = -np.stack([g[1:-1, 1:-1, 1:-1][rim] for g in np.gradient(smooth)], -1).astype(np.float64)
-    length = np.linalg.norm(slope, axis=1, keepdims=True)
-    normal = np.where(length > 1e-6, slope / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    normal[voxel[:, 2] == 0] = [0.0, 0.0, -1.0]
-    return _Unseen(voxel, normal)

@@ -38,6 +38,14 @@ RIM = 16, 0.4  # neighbours; share of their mean distance by which their middle 
 SEEN_THROUGH = 0.015  # metres: a view that sees something so far behind a point sees through it
 CONTRADICTED = 0.25  # share of a view's points that others see through, on average, from which it must go
 
+# Smoothing (`smooth.py`)
+LEAST_CELL = 0.0015  # metres: points in cubes of half a voxel, at least this, are taken together
+WIDTHS = 0.002, 0.003, 0.0045, 0.0065  # metres: standard deviations of the weights that a surface is fitted with
+REACH = 2.0  # such widths: points farther off do not count
+ALIKE = 0.7  # cosine between normals of points of one side
+AGREE = 2.0  # standard errors by which a wider fit may differ from narrower ones
+FEWEST_CELLS = 12  # that a fit needs
+
 # Votes on voxels (`fuse.py`)
 # Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.
 HIT, PASS, GLIMPSE = 2.5, 3.0, 1.0
@@ -45,4 +53,6 @@ BEHIND_VOXEL = 0.004  # metres, beside the voxel's own size, that a return lies 
 LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
 FEWEST_VOXELS = 4  # of a piece that is kept
 FOOT = 0.015  # metres above the lowest of what is seen: so much of it is taken to reach down to the table
+STEEP = 0.5  # cosine between a wall's normal and the vertical, at most: it goes on down to the table
+CONTINUED = 0.5  # cosine between normals of an unseen voxel and of a seen one whose plane goes on through it, at least
 THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)

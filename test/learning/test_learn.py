@@ -103,6 +103,50 @@ def test_the_foot_of_what_stands_upright_is_whole():
     assert len(np.unique(turn // 6)) >= 58  # of 60
 
 
+@pytest.fixture(scope="module")
+def cup():
+    """An open cup with walls of 3.5 mm: its radius, its model of 2 mm voxels from five views, and the model's points in
+    the cup's frame."""
+    radius, wall = 0.046, 0.0035
+    side = trimesh.creation.annulus(radius - wall, radius, 0.08, sections=90).apply_translation((0, 0, 0.04))
+    bottom = trimesh.creation.cylinder(radius, wall, sections=90).apply_translation((0, 0, wall / 2))
+    mesh = trimesh.util.concatenate([side, bottom])
+    captures = capture(resting_object("cup", mesh), np.eye(4), 5, (0.0, 0.0), seed=5)
+    found = learn(captures.frames, "cup", LearnerSettings(voxel_size=0.002))
+    return radius, found.model, found.model.surface_points + found.T_table_object[:3, 3]
+
+
+def test_a_wall_goes_on_down_to_the_table(cup):
+    """Returns less than three millimetres above the table count as the table's."""
+    radius, model, points = cup
+    foot = (points[:, 2] < 0.002) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.002)
+    foot &= np.abs(model.surface_normal[:, 2]) < 0.3
+    turn = np.degrees(np.arctan2(points[foot, 1], points[foot, 0])) % 360
+    assert len(np.unique(turn // 6)) >= 58  # of 60
+    assert (model.surface_views[foot & (points[:, 2] < 0.001)] == 0).all()
+
+
+def test_a_smooth_wall_is_smooth(cup):
+    """Beside the camera's bias, which is as good as the same within a centimetre."""
+    radius, model, points = cup
+    outward = np.einsum("ij,ij->i", model.surface_normal[:, :2], points[:, :2]) / radius
+    wall = (model.surface_views > 0) & (outward > 0.7) & (points[:, 2] > 0.02) & (points[:, 2] < 0.06)
+    points, radii = points[wall], np.hypot(*points[wall, :2].T)
+    near = cKDTree(points).query_ball_point(points, 0.005)
+    rough = np.array([radii[k] - np.median(radii[own]) for k, own in enumerate(near)])
+    assert np.quantile(np.abs(rough), 0.9) < 0.00012
+
+
+def test_nothing_unseen_stands_in_a_wall_that_was_seen(cup):
+    """Voxels between both sides of a wall are inside; those that hold a side and too few points have its plane."""
+    radius, model, points = cup
+    inside = (points[:, 2] > 0.02) & (points[:, 2] < 0.06) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.006)
+    seen, unseen = inside & (model.surface_views > 0), inside & (model.surface_views == 0)
+    _, nearest = cKDTree(points[seen]).query(points[unseen])
+    off = np.einsum("ij,ij->i", model.surface_normal[seen][nearest], points[unseen] - points[seen][nearest])
+    assert np.median(np.abs(off)) < 0.00025
+
+
 def test_what_no_view_saw_is_known(bracket):
     captures = capture(*bracket, 1, (0.0, 0.0), seed=3)
     found = learn(captures.frames, "bracket", SETTINGS)
