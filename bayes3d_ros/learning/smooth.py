@@ -8,6 +8,7 @@ intervals (Goldenshluger and Nemirovski 1997): a wider fit is taken where it agr
 round sides are averaged over centimetres and edges over millimetres.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -86,15 +87,20 @@ def _cells(surface: Surface, side: float) -> _Cells:
 def _fit(cells: _Cells, width: float) -> _Fits:
     """width: standard deviation of the Gaussian weight about each cell, metres."""
     tree, count = cKDTree(cells.middle), len(cells.points)
-    fits = _Fits(np.zeros((count, 6)), np.zeros(count), np.zeros(count), np.zeros(count, int))
-    for start in range(0, count, _CENTRES):
-        centres = slice(start, min(start + _CENTRES, count))
-        near = tree.query_ball_point(cells.middle[centres], REACH * width, workers=-1)
-        number = np.array([len(one) for one in near])
-        own, other = np.repeat(np.arange(centres.start, centres.stop), number), np.concatenate(near).astype(int)
-        for into, part in zip(fits, _fit_about(cells, width, own, other, number), strict=True):
-            into[centres] = part
-    return fits
+    half = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
+    short = _Cells(cells.of_point, *(part.astype(np.float32) for part in half))  # pairs are many, and memory is slow
+
+    def part(start: int) -> _Fits:
+        centres = np.arange(start, min(start + _CENTRES, count))
+        near = tree.query_ball_point(cells.middle[centres], REACH * width)
+        own, other = np.repeat(centres, [len(one) for one in near]), np.concatenate(near).astype(int)
+        alike = np.einsum("pj,pj->p", short.normal[own], short.normal[other]) > ALIKE
+        number = np.bincount(own[alike] - start, minlength=len(centres))  # each is its own neighbour: at least one
+        return _fit_about(short, width, own[alike], other[alike], number)
+
+    with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
+        parts = list(pool.map(part, range(0, count, _CENTRES)))
+    return _Fits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def _fit_about(
@@ -102,29 +108,29 @@ def _fit_about(
 ) -> _Fits:
     """Fits about the cells `own`, in order, each to the `number` of cells `other`."""
     apart = cells.middle[other] - cells.middle[own]
-    x, y = np.einsum("pij,pj->ip", cells.along[own], apart) / width
+    x, y = np.einsum("pij,pj->ip", cells.along[own], apart) / np.float32(width)
     z = np.einsum("pj,pj->p", cells.normal[own], apart)
-    alike = np.einsum("pj,pj->p", cells.normal[own], cells.normal[other]) > ALIKE
-    weight = cells.points[other] * np.exp(-(x**2 + y**2) / 2) * (alike & (np.abs(z) < width))
+    weight = cells.points[other] * np.exp(-(x**2 + y**2) / 2) * (np.abs(z) < width)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     first = np.concatenate([[0], np.cumsum(number)[:-1]])
 
     def total(values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "K"]:
         return np.add.reduceat(values, first)
 
-    moments, spread = np.empty((len(number), 6, 6)), np.empty((len(number), 6, 6))
-    weighted = weight * terms
-    twice = weighted * (weight / cells.points[other])
+    moments, weighted = np.empty((len(number), 6, 6)), weight * terms
     for i in range(6):
         for j in range(i + 1):
             moments[:, i, j] = moments[:, j, i] = total(weighted[i] * terms[j])
-            spread[:, i, j] = spread[:, j, i] = total(twice[i] * terms[j])
     mass = moments[:, 0, 0].copy()
     moments += _RIDGE * mass[:, None, None] * np.eye(6)
     inverse = np.linalg.inv(moments)
     found = np.einsum("kij,jk->ki", inverse, np.stack([total(part * z) for part in weighted]))
-    variance = np.einsum("ki,kij,kj->k", inverse[:, 0], spread, inverse[:, 0])
-    off = z - np.einsum("ip,pi->p", terms, np.repeat(found, number, 0))
+
+    def at_cells(terms_of: Float[np.ndarray, "K 6"]) -> Float[np.ndarray, "P"]:
+        return np.einsum("ip,pi->p", terms, np.repeat(terms_of.astype(np.float32), number, 0))
+
+    variance = total((weight * at_cells(inverse[:, 0])) ** 2 / cells.points[other])  # each cell moves c0 by so much
+    off = z - at_cells(found)
     scale = width ** np.array([0, 1, 1, 2, 2, 2])
     return _Fits(found / scale, variance, total(weight * off**2) / mass, total((weight > 0).astype(int)))
 
