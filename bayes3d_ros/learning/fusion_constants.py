@@ -54,5 +54,6 @@ LOW = 0.012  # metres: voxels so near to the table are free where the table is s
 FEWEST_VOXELS = 4  # of a piece that is kept
 FOOT = 0.015  # metres above the lowest of what is seen: so much of it is taken to reach down to the table
 STEEP = 0.5  # cosine between a wall's normal and the vertical, at most: it goes on down to the table
+BELOW, BESIDE = 2.5, 0.75  # voxels to what is the lower part of a wall, at most: across the table; along the wall
 CONTINUED = 0.5  # cosine between normals of an unseen voxel and of a seen one whose plane goes on through it, at least
 THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.planes import Patches
 from bayes3d_ros.geometry.voxel_grid import VoxelGrid
-from bayes3d_ros.learning.fusion_constants import CONTINUED, FOOT, STEEP
+from bayes3d_ros.learning.fusion_constants import ALIKE, BELOW, BESIDE, CONTINUED, FOOT, STEEP
 
 
 class UnseenPlanes(NamedTuple):
@@ -28,6 +29,7 @@ def down_to_table(seen: Patches, grid: VoxelGrid) -> UnseenPlanes:
     row_of, size = grid.row_of(seen.voxel), grid.voxel_size
     centre = grid.origin + (seen.voxel + 0.5) * size
     wall = np.flatnonzero((np.abs(seen.normal[:, 2]) < STEEP) & (centre[:, 2] < FOOT))
+    wall = wall[_lowest(seen.voxel[wall], seen.normal[wall])]
     found: dict[tuple[int, ...], tuple[np.ndarray, float]] = {}
     for row in wall[np.argsort(-centre[wall, 2])]:
         normal = seen.normal[row]
@@ -45,6 +47,20 @@ def down_to_table(seen: Patches, grid: VoxelGrid) -> UnseenPlanes:
     voxel = np.array(list(found), int).reshape(-1, 3)
     normal = np.array([normal for normal, _ in found.values()]).reshape(-1, 3)
     return UnseenPlanes(voxel, normal, np.array([offset for _, offset in found.values()]))
+
+
+def _lowest(voxel: Int[np.ndarray, "W 3"], normal: Float[np.ndarray, "W 3"]) -> Bool[np.ndarray, "W"]:
+    """Voxels of walls below which, or a voxel or two before or behind that, no wall of the same side was seen."""
+    lowest = np.ones(len(voxel), bool)
+    if len(voxel) > 1:
+        pairs = cKDTree(voxel[:, :2]).query_pairs(BELOW, output_type="ndarray")
+        one, other = pairs[np.einsum("pi,pi->p", normal[pairs[:, 0]], normal[pairs[:, 1]]) > ALIKE].T
+        apart = voxel[other, :2] - voxel[one, :2]
+        beside = np.abs(normal[one, 0] * apart[:, 1] - normal[one, 1] * apart[:, 0])
+        one, other = one[beside < BESIDE], other[beside < BESIDE]
+        lowest[one[voxel[other, 2] < voxel[one, 2]]] = False
+        lowest[other[voxel[one, 2] < voxel[other, 2]]] = False
+    return lowest
 
 
 class NearestPlanes(NamedTuple):
