@@ -5,10 +5,12 @@
 Every view votes on every voxel: for a surface where points fall into it, for free space where rays pass through to
 something behind it; what a view's rays do not reach it says nothing of. Votes are log odds, so that flying pixels of
 one view, or one view whose pose is wrong, lose against the others. Planes are then fitted to the points of the voxels
-that won. Voxels that nobody saw count as solid inside the convex hull of the surface, and are known to be unseen.
+that won, after the points have been smoothed (`smooth.py`). Voxels that nobody saw count as solid inside the convex
+hull of the surface, but for those before all planes beside them, and are known to be unseen (`unseen.py`).
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +20,15 @@ from scipy.spatial import ConvexHull, QhullError
 
 from bayes3d_ros.geometry.camera import nearest_pixels
 from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.edges import WALL
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.planes import Patches, fit_planes
 from bayes3d_ros.geometry.voxel_grid import VoxelGrid
-from bayes3d_ros.geometry.voxels import VoxelSolid, two_planes
+from bayes3d_ros.geometry.voxels import SecondPlanes, VoxelSolid, two_planes
 from bayes3d_ros.learning.fusion_constants import (
     BEHIND_VOXEL,
+    BEHIND_WALL,
+    FACING,
     FEWEST_VOXELS,
     FOOT,
     GLIMPSE,
@@ -79,10 +84,11 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     patches = fit_planes(SurfaceSamples(points, normals, area), grid)
     noise = _noise_of_a_neighbour(patches, grid)
     clear = Patches(*(part[~noise] for part in patches))
-    walls = down_to_table(clear, grid)
-    seen, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+    front, second = two_planes(SurfaceSamples(points, normals, area), clear, grid, oriented=True)
+    walls = down_to_table(_steeper(front, second, grid), grid, partial(_seen_through, views))
+    held, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)  # by planes
     for part in (clear, walls):
-        seen[tuple(part.voxel.T)] = True
+        held[tuple(part.voxel.T)] = True
     # Where noise was dropped the plane next door decides; behind it is solid.
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (clear.voxel + 0.5) * voxel_size
@@ -90,13 +96,12 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     unknown = (hits + glimpses == 0) & _within(hull, grid)
     where = np.argwhere(unknown)
     unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
-    solid = _pieces(seen | behind | unknown)
-    unseen = continued(unseen_surface(solid, seen), clear, grid)
+    solid = _pieces(held | behind | unknown)
+    unseen = continued(unseen_surface(solid, held), clear, grid)
     counts = hits[tuple(clear.voxel.T)]
-    clear, second = two_planes(SurfaceSamples(points, normals, area), clear, grid, oriented=True)
     counts = np.concatenate([counts, np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
     voxel, normal, offset = (
-        np.concatenate([getattr(part, key) for part in (clear, walls, unseen)]) for key in ("voxel", "normal", "offset")
+        np.concatenate([getattr(part, key) for part in (front, walls, unseen)]) for key in ("voxel", "normal", "offset")
     )
     order = np.argsort(grid.flat(voxel))
     surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order], *second)
@@ -109,6 +114,30 @@ def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:
     ends = np.cumsum([len(view.surface.points) for view in views])[:-1]
     parts = zip(*(np.split(part, ends) for part in smooth(every, voxel_size)), strict=True)
     return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)]
+
+
+def _steeper(front: Patches, second: SecondPlanes, grid: VoxelGrid) -> Patches:
+    """Of voxels that hold an edge the side that is steeper."""
+    row = grid.row_of(front.voxel)(second.voxel)
+    taken = (second.kind != WALL) & (np.abs(second.normal[:, 2]) < np.abs(front.normal[row, 2]))
+    normal, offset = front.normal.copy(), front.offset.copy()
+    normal[row[taken]], offset[row[taken]] = second.normal[taken], second.offset[taken]
+    return front._replace(normal=normal, offset=offset)
+
+
+def _seen_through(
+    views: Sequence[Seen], points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]
+) -> Bool[np.ndarray, "N"]:
+    """Whether any view that a surface faces sees something behind it at these points (metres, table frame)."""
+    found = np.zeros(len(points), bool)
+    for view in views:
+        T = np.linalg.inv(view.T_table_camera)
+        u, v, z, inside = nearest_pixels(points @ T[:3, :3].T + T[:3, 3], view.frame.intrinsics)
+        away = view.T_table_camera[:3, 3] - points
+        facing = np.einsum("ij,ij->i", normals, away) > FACING * np.linalg.norm(away, axis=1)
+        with np.errstate(invalid="ignore"):
+            found |= inside & facing & (view.frame.depth[v * inside, u * inside] > z + BEHIND_WALL)
+    return found
 
 
 def _grid(surfaces: Sequence[Surface], voxel_size: float) -> VoxelGrid:

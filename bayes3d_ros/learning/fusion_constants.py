@@ -42,8 +42,8 @@ CONTRADICTED = 0.25  # share of a view's points that others see through, on aver
 LEAST_CELL = 0.0015  # metres: points in cubes of half a voxel, at least this, are taken together
 WIDTHS = 0.002, 0.003, 0.0045, 0.0065  # metres: standard deviations of the weights that a surface is fitted with
 REACH = 2.0  # such widths: points farther off do not count
-ALIKE = 0.7  # cosine between normals of points of one side
-AGREE = 2.0  # standard errors by which a wider fit may differ from narrower ones
+ALIKE = 0.7  # cosine between normals of one side; also of voxels of one wall (`unseen.py`)
+AGREE = 2.0  # standard errors: a wider fit is taken where intervals of so many about it and all narrower ones meet
 FEWEST_CELLS = 12  # that a fit needs
 
 # Votes on voxels (`fuse.py`)
@@ -52,8 +52,10 @@ HIT, PASS, GLIMPSE = 2.5, 3.0, 1.0
 BEHIND_VOXEL = 0.004  # metres, beside the voxel's own size, that a return lies behind a voxel that its ray passed
 LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
 FEWEST_VOXELS = 4  # of a piece that is kept
-FOOT = 0.015  # metres above the lowest of what is seen: so much of it is taken to reach down to the table
+FOOT = 0.015  # metres: what is so near the lowest return, and walls so near the table, reach down to the table
 STEEP = 0.5  # cosine between a wall's normal and the vertical, at most: it goes on down to the table
-BELOW, BESIDE = 2.5, 0.75  # voxels to what is the lower part of a wall, at most: across the table; along the wall
+BELOW, BESIDE = 2.5, 0.3  # voxels to the lower part of a wall, at most: across the table; along the wall
+BEHIND_WALL = 0.003  # metres behind a wall, beyond which a view sees through it
+FACING = 0.3  # cosine between a wall's normal and the way to a camera that sees through it, at least
 CONTINUED = 0.5  # cosine between normals of an unseen voxel and of a seen one whose plane goes on through it, at least
 THIN = 3.0, 0.35  # a voxel is a neighbour's noise if that holds so many times its points, on a plane so near (voxels)

@@ -12,13 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.learning.fusion_constants import AGREE, ALIKE, FEWEST_CELLS, LEAST_CELL, REACH, WIDTHS
 from bayes3d_ros.learning.segment import Surface
 
 _CENTRES = 1024  # at once, which bounds memory
+_POWERS = np.array([0, 1, 1, 2, 2, 2])  # of lengths in the terms of a fit
 _RIDGE = 1e-3  # of the weight of a fit: where all points lie on a line
 
 
@@ -37,14 +38,14 @@ class _Fits(NamedTuple):
     all from its middle, in metres."""
 
     terms: Float[np.ndarray, "C 6"]
-    variance: Float[np.ndarray, "C"]  # of c0, where a point has 1
+    variance: Float[np.ndarray, "C"]  # of c0 if that of a point is 1
     residual: Float[np.ndarray, "C"]  # mean square of the cells about it, square metres
     cells: Int[np.ndarray, "C"]  # how many
 
 
 def smooth(surface: Surface, voxel_size: float) -> Surface:
     """The same points, moved along their normals onto the surface, with its normals. Points with few others about them
-    stay where they are."""
+    stay where they are. Normals are unit vectors."""
     cells = _cells(surface, max(voxel_size / 2, LEAST_CELL))
     count = len(cells.points)
     chosen, least, most = np.zeros((count, 6)), np.full(count, -np.inf), np.full(count, np.inf)
@@ -52,9 +53,13 @@ def smooth(surface: Surface, voxel_size: float) -> Surface:
     noise = None
     for width in WIDTHS:
         fits = _fit(cells, width)
-        if noise is None:  # of one point, as the narrowest fit sees it
-            noise = np.sqrt(np.median(fits.residual) * np.median(cells.points))
-        enough, reach = fits.cells >= FEWEST_CELLS, AGREE * noise * np.sqrt(fits.variance)
+        enough = fits.cells >= FEWEST_CELLS
+        if noise is None and enough.mean() > 0.5:  # of one point, as the narrowest fits see it that have cells enough
+            spare = fits.cells[enough] / (fits.cells[enough] - len(_POWERS))
+            noise = np.sqrt(np.median(fits.residual[enough] * cells.points[enough] * spare))
+        if noise is None:
+            continue
+        reach = AGREE * noise * np.sqrt(fits.variance)
         least = np.where(enough, np.maximum(least, fits.terms[:, 0] - reach), least)
         most = np.where(enough, np.minimum(most, fits.terms[:, 0] + reach), most)
         wider &= least <= most
@@ -87,26 +92,29 @@ def _cells(surface: Surface, side: float) -> _Cells:
 def _fit(cells: _Cells, width: float) -> _Fits:
     """width: standard deviation of the Gaussian weight about each cell, metres."""
     tree, count = cKDTree(cells.middle), len(cells.points)
-    half = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
-    short = _Cells(cells.of_point, *(part.astype(np.float32) for part in half))  # pairs are many, and memory is slow
+    columns = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
+    near_zero = _Cells(
+        cells.of_point, *(column.astype(np.float32) for column in columns)
+    )  # pairs are many: half the memory
 
-    def part(start: int) -> _Fits:
+    def fits_from(start: int) -> _Fits:
         centres = np.arange(start, min(start + _CENTRES, count))
         near = tree.query_ball_point(cells.middle[centres], REACH * width)
         own, other = np.repeat(centres, [len(one) for one in near]), np.concatenate(near).astype(int)
-        alike = np.einsum("pj,pj->p", short.normal[own], short.normal[other]) > ALIKE
+        alike = np.einsum("pj,pj->p", near_zero.normal[own], near_zero.normal[other]) > ALIKE
         number = np.bincount(own[alike] - start, minlength=len(centres))  # each is its own neighbour: at least one
-        return _fit_about(short, width, own[alike], other[alike], number)
+        return _fit_about(near_zero, width, own[alike], other[alike], number)
 
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
-        parts = list(pool.map(part, range(0, count, _CENTRES)))
-    return _Fits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        parts = list(pool.map(fits_from, range(0, count, _CENTRES)))
+    return _Fits(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _fit_about(
     cells: _Cells, width: float, own: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"], number: Int[np.ndarray, "K"]
 ) -> _Fits:
-    """Fits about the cells `own`, in order, each to the `number` of cells `other`."""
+    """own: rows of the cells that fits are about, in order; other: rows of the cells that they are fitted to; number:
+    how many of these each fit has."""
     apart = cells.middle[other] - cells.middle[own]
     x, y = np.einsum("pij,pj->ip", cells.along[own], apart) / np.float32(width)
     z = np.einsum("pj,pj->p", cells.normal[own], apart)
@@ -131,11 +139,11 @@ def _fit_about(
 
     variance = total((weight * at_cells(inverse[:, 0])) ** 2 / cells.points[other])  # each cell moves c0 by so much
     off = z - at_cells(found)
-    scale = width ** np.array([0, 1, 1, 2, 2, 2])
+    scale = width**_POWERS
     return _Fits(found / scale, variance, total(weight * off**2) / mass, total((weight > 0).astype(int)))
 
 
-def _onto(surface: Surface, cells: _Cells, terms: Float[np.ndarray, "C 6"], fitted: np.ndarray) -> Surface:
+def _onto(surface: Surface, cells: _Cells, terms: Float[np.ndarray, "C 6"], fitted: Bool[np.ndarray, "C"]) -> Surface:
     own = cells.of_point
     along, normal, c = cells.along[own], cells.normal[own], terms[own].T
     apart = surface.points - cells.middle[own]

@@ -3,6 +3,7 @@
 """Surface that no view saw: walls that go on down to the table, planes that go on beside what was seen, and what closes
 the solid."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,46 +21,58 @@ class UnseenPlanes(NamedTuple):
 
     voxel: Int[np.ndarray, "U 3"]
     normal: Float[np.ndarray, "U 3"]
-    offset: Float[np.ndarray, "U"]  # metres from the voxel's centre
+    offset: Float[np.ndarray, "U"]  # metres from the voxel's centre, along the normal
 
 
-def down_to_table(seen: Patches, grid: VoxelGrid) -> UnseenPlanes:
-    """Walls go on down to the table from the lowest that is seen of them: returns near the table count as the
-    table's."""
-    row_of, size = grid.row_of(seen.voxel), grid.voxel_size
-    centre = grid.origin + (seen.voxel + 0.5) * size
-    wall = np.flatnonzero((np.abs(seen.normal[:, 2]) < STEEP) & (centre[:, 2] < FOOT))
-    wall = wall[_lowest(seen.voxel[wall], seen.normal[wall])]
-    found: dict[tuple[int, ...], tuple[np.ndarray, float]] = {}
-    for row in wall[np.argsort(-centre[wall, 2])]:
-        normal = seen.normal[row]
-        point = centre[row] + normal * seen.offset[row]
-        down = np.array([0.0, 0.0, -1.0]) + normal * normal[2]
-        down /= -down[2]
-        for layer in range(seen.voxel[row, 2] - 1, -1, -1):
-            z = grid.origin[2] + (layer + 0.5) * size
-            on = point + down * (point[2] - z)
-            cell = np.append(np.floor((on[:2] - grid.origin[:2]) / size).astype(int), layer)
-            if (cell < 0).any() or (cell >= grid.shape).any() or row_of(cell[None])[0] >= 0:
-                break
-            middle = grid.origin + (cell + 0.5) * size
-            found.setdefault(tuple(cell.tolist()), (normal, float(normal @ (point - middle))))
-    voxel = np.array(list(found), int).reshape(-1, 3)
-    normal = np.array([normal for normal, _ in found.values()]).reshape(-1, 3)
-    return UnseenPlanes(voxel, normal, np.array([offset for _, offset in found.values()]))
+# Whether any view saw something behind points of a surface that faces it. Points: metres, table frame; unit normals.
+SeenThrough = Callable[[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]], Bool[np.ndarray, "N"]]
+
+
+def down_to_table(sides: Patches, grid: VoxelGrid, seen_through: SeenThrough) -> UnseenPlanes:
+    """Walls go on down to the table from the lowest that is seen of them, within FOOT of the table: returns near the
+    table count as the table's. A wall does not go on where a view saw through it: what is above hangs over.
+
+    sides: planes of the voxels that views saw, at edges those of the steeper side.
+    """
+    row_of, size = grid.row_of(sides.voxel), grid.voxel_size
+    centre = grid.origin + (sides.voxel + 0.5) * size
+    wall = np.flatnonzero((np.abs(sides.normal[:, 2]) < STEEP) & (centre[:, 2] < FOOT))
+    wall = wall[_lowest(sides.voxel[wall], sides.normal[wall])]
+    voxel, normal, point = sides.voxel[wall], sides.normal[wall], centre[wall]
+    point = point + normal * sides.offset[wall, None]
+    down = normal * normal[:, 2:] - [0.0, 0.0, 1.0]
+    down /= -down[:, 2:]
+    goes_on, free = np.ones(len(wall), bool), np.zeros(len(wall), bool)
+    rows, cells = [np.zeros(0, int)], [np.zeros((0, 3), int)]
+    for below in range(1, int(voxel[:, 2].max(initial=0)) + 1):
+        layer = voxel[:, 2] - below
+        on = point + down * (point[:, 2] - (grid.origin[2] + (layer + 0.5) * size))[:, None]
+        cell = np.column_stack([np.floor((on[:, :2] - grid.origin[:2]) / size).astype(int), layer])
+        goes_on &= (cell >= 0).all(1) & (cell < grid.shape).all(1)
+        goes_on[goes_on] = row_of(cell[goes_on]) < 0
+        tested = goes_on & (layer > 0)  # beside the lowest layer the table is as near
+        free[tested] |= seen_through(on[tested], normal[tested])
+        rows.append(np.flatnonzero(goes_on))
+        cells.append(cell[goes_on])
+    row, cell = np.concatenate(rows), np.concatenate(cells)
+    row, cell = row[~free[row]], cell[~free[row]]
+    _, first = np.unique(grid.flat(cell), return_index=True)  # of several walls the one that was seen lowest
+    row, cell = row[first], cell[first]
+    middle = grid.origin + (cell + 0.5) * size
+    return UnseenPlanes(cell, normal[row], np.einsum("ij,ij->i", normal[row], point[row] - middle))
 
 
 def _lowest(voxel: Int[np.ndarray, "W 3"], normal: Float[np.ndarray, "W 3"]) -> Bool[np.ndarray, "W"]:
-    """Voxels of walls below which, or a voxel or two before or behind that, no wall of the same side was seen."""
+    """Voxels of walls of which no voxel one layer lower, within BELOW voxels before or behind, faces the same way."""
     lowest = np.ones(len(voxel), bool)
     if len(voxel) > 1:
         pairs = cKDTree(voxel[:, :2]).query_pairs(BELOW, output_type="ndarray")
         one, other = pairs[np.einsum("pi,pi->p", normal[pairs[:, 0]], normal[pairs[:, 1]]) > ALIKE].T
         apart = voxel[other, :2] - voxel[one, :2]
-        beside = np.abs(normal[one, 0] * apart[:, 1] - normal[one, 1] * apart[:, 0])
-        one, other = one[beside < BESIDE], other[beside < BESIDE]
-        lowest[one[voxel[other, 2] < voxel[one, 2]]] = False
-        lowest[other[voxel[one, 2] < voxel[other, 2]]] = False
+        along = np.abs(normal[one, 0] * apart[:, 1] - normal[one, 1] * apart[:, 0]) < BESIDE
+        higher = voxel[one, 2] - voxel[other, 2]
+        lowest[one[along & (higher == 1)]] = False
+        lowest[other[along & (higher == -1)]] = False
     return lowest
 
 
@@ -72,7 +85,7 @@ class NearestPlanes(NamedTuple):
 
 
 def nearest_planes(voxel: Int[np.ndarray, "V 3"], seen: Patches, grid: VoxelGrid) -> NearestPlanes:
-    """Of every voxel. seen: planes of the voxels that views saw."""
+    """Of every voxel, among the 3 x 3 x 3 about it. seen: planes of the voxels that views saw."""
     row_of, size = grid.row_of(seen.voxel), grid.voxel_size
     found = NearestPlanes(np.full(len(voxel), -1), np.full(len(voxel), np.inf), np.ones(len(voxel), bool))
     for step in np.indices((3, 3, 3)).reshape(3, -1).T - 1:
@@ -92,7 +105,7 @@ def _half(normal: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarr
 
 def continued(unseen: UnseenPlanes, seen: Patches, grid: VoxelGrid) -> UnseenPlanes:
     """Planes of seen voxels go on through unseen ones beside them that face the same way; behind them these are
-    inside."""
+    inside, and have no plane."""
     near = nearest_planes(unseen.voxel, seen, grid)
     there = (near.plane >= 0) & (np.einsum("ij,ij->i", unseen.normal, seen.normal[near.plane]) > CONTINUED)
     through = there & (np.abs(near.beyond) < _half(seen.normal[near.plane], grid.voxel_size))
@@ -102,10 +115,11 @@ def continued(unseen: UnseenPlanes, seen: Patches, grid: VoxelGrid) -> UnseenPla
     return UnseenPlanes(unseen.voxel[kept], normal[kept], offset[kept])
 
 
-def unseen_surface(solid: Bool[np.ndarray, "X Y Z"], seen: Bool[np.ndarray, "X Y Z"]) -> UnseenPlanes:
-    """Voxels of the solid's rim that no view saw, with planes through their middles: on the table straight down."""
+def unseen_surface(solid: Bool[np.ndarray, "X Y Z"], held: Bool[np.ndarray, "X Y Z"]) -> UnseenPlanes:
+    """Voxels of the solid's rim that have no plane yet, with planes through their middles: on the table straight down.
+    held: voxels that have one."""
     padded = np.pad(solid, 1)
-    rim = solid & ~ndimage.binary_erosion(padded)[1:-1, 1:-1, 1:-1] & ~seen
+    rim = solid & ~ndimage.binary_erosion(padded)[1:-1, 1:-1, 1:-1] & ~held
     voxel = np.argwhere(rim)
     blurred = ndimage.gaussian_filter(padded.astype(np.float32), 1.0)
     slope = -np.stack([g[1:-1, 1:-1, 1:-1][rim] for g in np.gradient(blurred)], -1).astype(np.float64)

@@ -124,6 +124,35 @@ def test_a_wall_goes_on_down_to_the_table(cup):
     turn = np.degrees(np.arctan2(points[foot, 1], points[foot, 0])) % 360
     assert len(np.unique(turn // 6)) >= 58  # of 60
     assert (model.surface_views[foot & (points[:, 2] < 0.001)] == 0).all()
+    wall = (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.002) & (np.abs(model.surface_normal[:, 2]) < 0.3)
+    for height in (0.004, 0.006, 0.01):
+        here = wall & (np.abs(points[:, 2] - height) < 0.0015)
+        turn = np.degrees(np.arctan2(points[here, 1], points[here, 0])) % 360
+        assert len(np.unique(turn // 6)) >= 59
+
+
+def test_what_hangs_over_the_table_has_no_walls_below():
+    """A slab on a foot: the views see the table under the slab's rim."""
+    foot = trimesh.creation.box((0.03, 0.03, 0.01)).apply_translation((0, 0, 0.005))
+    slab = trimesh.creation.box((0.08, 0.08, 0.02)).apply_translation((0, 0, 0.02))
+    captures = capture(
+        resting_object("stool", trimesh.util.concatenate([foot, slab])), np.eye(4), 5, (0.0, 0.0), seed=4
+    )
+    found = learn(captures.frames, "stool", LearnerSettings(voxel_size=0.004))
+    points = found.model.surface_points + found.T_table_object[:3, 3]
+    upright = np.abs(found.model.surface_normal[:, 2]) < 0.3
+    assert (upright & (points[:, 2] < 0.006) & (np.abs(points[:, :2]).max(1) > 0.03)).sum() == 0
+
+
+def test_the_sides_of_a_flat_thing_are_upright_down_to_the_table():
+    """Its top and a side share voxels: the side's plane goes on down, and not one between both."""
+    box = trimesh.creation.box((0.08, 0.06, 0.008)).apply_translation((0, 0, 0.004))
+    captures = capture(resting_object("tile", box), np.eye(4), 5, (0.0, 0.0), seed=6)
+    found = learn(captures.frames, "tile", LearnerSettings(voxel_size=0.004))
+    points = found.model.surface_points + found.T_table_object[:3, 3]
+    low = (points[:, 2] < 0.002) & (np.abs(found.model.surface_normal[:, 2]) < 0.6)
+    outside = (np.abs(points[low, :2]) - [0.04, 0.03]).max(1)
+    assert low.sum() > 40 and outside.max() < 0.002
 
 
 def test_a_smooth_wall_is_smooth(cup):
