@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bayes3d_ros.geometry.camera import Intrinsics, resize_nearest, trustworthy
+from bayes3d_ros.geometry.camera import Intrinsics, nearest_pixels, resize_nearest, trustworthy
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,19 @@ class DepthFrame:
         expected = (self.intrinsics.height, self.intrinsics.width)
         if self.depth.shape != expected:
             raise ValueError(f"depth image is {self.depth.shape[::-1]}, intrinsics are for {expected[::-1]}")
+
+
+def sees_beyond(
+    frame: DepthFrame,
+    T_table_camera: Float[np.ndarray, "4 4"],
+    points: Float[np.ndarray, "N 3"],
+    distance: float,
+) -> Bool[np.ndarray, "N"]:
+    """Whether the frame, from this pose, has returns by more than a distance behind points (metres, table frame)."""
+    T = np.linalg.inv(T_table_camera)
+    u, v, z, inside = nearest_pixels(points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
+    with np.errstate(invalid="ignore"):
+        return inside & (frame.depth[v * inside, u * inside] > z + distance)
 
 
 class Reduced(NamedTuple):

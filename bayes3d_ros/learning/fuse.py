@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from bayes3d_ros.geometry.camera import nearest_pixels
-from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame, sees_beyond
 from bayes3d_ros.geometry.edges import WALL
 from bayes3d_ros.geometry.mesh import SurfaceSamples
 from bayes3d_ros.geometry.planes import Patches, fit_planes
@@ -81,10 +81,11 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     kept = surface.ravel()[index]
     points, normals, index = points[kept], normals[kept], index[kept]
     area = voxel_size**2 / float(np.median(np.unique(index, return_counts=True)[1]))
-    patches = fit_planes(SurfaceSamples(points, normals, area), grid)
+    samples = SurfaceSamples(points, normals, area)
+    patches = fit_planes(samples, grid)
     noise = _noise_of_a_neighbour(patches, grid)
     clear = Patches(*(part[~noise] for part in patches))
-    front, second = two_planes(SurfaceSamples(points, normals, area), clear, grid, oriented=True)
+    front, second = two_planes(samples, clear, grid, oriented=True)
     walls = down_to_table(_steeper(front, second, grid), grid, partial(_seen_through, views))
     held, behind = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)  # by planes
     for part in (clear, walls):
@@ -98,8 +99,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
     solid = _pieces(held | behind | unknown)
     unseen = continued(unseen_surface(solid, held), clear, grid)
-    counts = hits[tuple(clear.voxel.T)]
-    counts = np.concatenate([counts, np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
+    counts = np.concatenate([hits[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
     voxel, normal, offset = (
         np.concatenate([getattr(part, key) for part in (front, walls, unseen)]) for key in ("voxel", "normal", "offset")
     )
@@ -131,12 +131,9 @@ def _seen_through(
     """Whether any view that a surface faces sees something behind it at these points (metres, table frame)."""
     found = np.zeros(len(points), bool)
     for view in views:
-        T = np.linalg.inv(view.T_table_camera)
-        u, v, z, inside = nearest_pixels(points @ T[:3, :3].T + T[:3, 3], view.frame.intrinsics)
         away = view.T_table_camera[:3, 3] - points
         facing = np.einsum("ij,ij->i", normals, away) > FACING * np.linalg.norm(away, axis=1)
-        with np.errstate(invalid="ignore"):
-            found |= inside & facing & (view.frame.depth[v * inside, u * inside] > z + BEHIND_WALL)
+        found |= facing & sees_beyond(view.frame, view.T_table_camera, points, BEHIND_WALL)
     return found
 
 

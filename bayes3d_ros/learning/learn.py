@@ -11,8 +11,7 @@ import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from bayes3d_ros.geometry.camera import nearest_pixels
-from bayes3d_ros.geometry.depth_frame import DepthFrame
+from bayes3d_ros.geometry.depth_frame import DepthFrame, sees_beyond
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved, residual_between
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
@@ -237,20 +236,15 @@ def _worst(
             f"expected at most {1e3 * settings.max_shift:.0f}"
         )
     through = {
-        k: float(np.mean([_seen_through(aligned[k], frames[j], poses[j]) for j in aligned if j != k])) for k in aligned
+        k: float(
+            np.mean([sees_beyond(frames[j], poses[j], aligned[k].points, SEEN_THROUGH) for j in aligned if j != k])
+        )
+        for k in aligned
     }
     wrong = max(through, key=lambda k: through[k])
     if len(aligned) > 2 and through[wrong] > CONTRADICTED:
         return wrong, f"other views see through {through[wrong]:.0%} of its points: its camera pose must be wrong"
     return None, ""
-
-
-def _seen_through(surface: Surface, frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"]) -> float:
-    """Share of a thing's points that this frame sees something far behind."""
-    T = np.linalg.inv(T_table_camera)
-    u, v, z, inside = nearest_pixels(surface.points @ T[:3, :3].T + T[:3, 3], frame.intrinsics)
-    with np.errstate(invalid="ignore"):
-        return float((frame.depth[v[inside], u[inside]] > z[inside] + SEEN_THROUGH).sum() / len(z))
 
 
 def _correction(frame: DepthFrame, pose: Float[np.ndarray, "4 4"], surface: Surface) -> tuple[float, float]:

@@ -47,12 +47,14 @@ def smooth(surface: Surface, voxel_size: float) -> Surface:
     """The same points, moved along their normals onto the surface, with its normals. Points with few others about them
     stay where they are. Normals are unit vectors."""
     cells = _cells(surface, max(voxel_size / 2, LEAST_CELL))
-    count = len(cells.points)
+    tree, count = cKDTree(cells.middle), len(cells.points)
+    columns = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
+    halved = _Cells(cells.of_point, *(column.astype(np.float32) for column in columns))  # pairs of cells are many
     chosen, least, most = np.zeros((count, 6)), np.full(count, -np.inf), np.full(count, np.inf)
     fitted, wider = np.zeros(count, bool), np.ones(count, bool)
     noise = None
     for width in WIDTHS:
-        fits = _fit(cells, width)
+        fits = _fit(halved, tree, width)
         enough = fits.cells >= FEWEST_CELLS
         if noise is None and enough.mean() > 0.5:  # of one point, as the narrowest fits see it that have cells enough
             spare = fits.cells[enough] / (fits.cells[enough] - len(_POWERS))
@@ -89,21 +91,17 @@ def _cells(surface: Surface, side: float) -> _Cells:
     return _Cells(of_point, mean(points), normal, count.astype(float), along)
 
 
-def _fit(cells: _Cells, width: float) -> _Fits:
-    """width: standard deviation of the Gaussian weight about each cell, metres."""
-    tree, count = cKDTree(cells.middle), len(cells.points)
-    columns = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
-    near_zero = _Cells(
-        cells.of_point, *(column.astype(np.float32) for column in columns)
-    )  # pairs are many: half the memory
+def _fit(cells: _Cells, tree: cKDTree, width: float) -> _Fits:
+    """tree: of the cells' middles; width: standard deviation of the Gaussian weight about each cell, metres."""
+    count = len(cells.points)
 
     def fits_from(start: int) -> _Fits:
         centres = np.arange(start, min(start + _CENTRES, count))
-        near = tree.query_ball_point(cells.middle[centres], REACH * width)
+        near = tree.query_ball_point(tree.data[centres], REACH * width)
         own, other = np.repeat(centres, [len(one) for one in near]), np.concatenate(near).astype(int)
-        alike = np.einsum("pj,pj->p", near_zero.normal[own], near_zero.normal[other]) > ALIKE
+        alike = np.einsum("pj,pj->p", cells.normal[own], cells.normal[other]) > ALIKE
         number = np.bincount(own[alike] - start, minlength=len(centres))  # each is its own neighbour: at least one
-        return _fit_about(near_zero, width, own[alike], other[alike], number)
+        return _fit_about(cells, width, own[alike], other[alike], number)
 
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
         parts = list(pool.map(fits_from, range(0, count, _CENTRES)))

@@ -90,6 +90,12 @@ def test_the_notch_is_free_and_the_inside_is_solid(learned):
     assert not solid(0.03, 0.0, 0.08)
 
 
+def sixtieths(points):
+    """In how many of the sixty parts of a turn about the z axis there are points."""
+    turn = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    return len(np.unique(turn // 6))
+
+
 def test_the_foot_of_what_stands_upright_is_whole():
     """Beside a wall that faces the camera the table is in sight, and the wall is hardly nearer than that."""
     radius = 0.046
@@ -99,8 +105,7 @@ def test_the_foot_of_what_stands_upright_is_whole():
     points = found.model.surface_points + found.T_table_object[:3, 3]
     seen = found.model.surface_views > 0
     wall = seen & (points[:, 2] > 0.005) & (points[:, 2] < 0.01) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.003)
-    turn = np.degrees(np.arctan2(points[wall, 1], points[wall, 0])) % 360
-    assert len(np.unique(turn // 6)) >= 58  # of 60
+    assert sixtieths(points[wall]) >= 58
 
 
 @pytest.fixture(scope="module")
@@ -121,14 +126,12 @@ def test_a_wall_goes_on_down_to_the_table(cup):
     radius, model, points = cup
     foot = (points[:, 2] < 0.002) & (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.002)
     foot &= np.abs(model.surface_normal[:, 2]) < 0.3
-    turn = np.degrees(np.arctan2(points[foot, 1], points[foot, 0])) % 360
-    assert len(np.unique(turn // 6)) >= 58  # of 60
+    assert sixtieths(points[foot]) >= 58
     assert (model.surface_views[foot & (points[:, 2] < 0.001)] == 0).all()
     wall = (np.abs(np.hypot(*points[:, :2].T) - radius) < 0.002) & (np.abs(model.surface_normal[:, 2]) < 0.3)
     for height in (0.004, 0.006, 0.01):
         here = wall & (np.abs(points[:, 2] - height) < 0.0015)
-        turn = np.degrees(np.arctan2(points[here, 1], points[here, 0])) % 360
-        assert len(np.unique(turn // 6)) >= 59
+        assert sixtieths(points[here]) >= 59
 
 
 def test_what_hangs_over_the_table_has_no_walls_below():
