@@ -88,6 +88,15 @@ def test_every_window(window, hypotheses, image, arrays):
     np.testing.assert_allclose(gain, np.asarray(after - before), atol=0.02, rtol=2e-5)
 
 
+def test_the_gain_is_a_number_where_returns_may_be_far_away(hypotheses, image, arrays):
+    """The density of an outlier is then tiny, and the odds of a return on a surface are large."""
+    far = image._replace(outlier_scale=jnp.float32(3 / 1000**3))
+    gain = np.asarray(compiled_gain(hypotheses, None, far, arrays, NOISE, 3))
+    depth = pad_scene(compiled_depth(hypotheses, None, far, arrays), 3)
+    after, before = (log_likelihood_scene(d, far, NOISE, 3) for d in (depth, jnp.full_like(depth[:1], jnp.inf)))
+    np.testing.assert_allclose(gain, np.asarray(after - before), atol=0.1, rtol=2e-5)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 def test_what_is_nowhere_is_not_rendered(wrong, hypotheses, image, arrays):
     """Nor does it lead the kernel astray: a pose that is not a number says nothing, the others what they said."""

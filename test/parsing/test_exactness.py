@@ -295,10 +295,11 @@ def regions(mixed, truth):
 
 @pytest.mark.parametrize("heats", [0, 4])
 def test_objects_that_are_moved_again_have_the_same_posterior(hidden, hidden_exact, rejuvenated, step, heats):
-    (_, mixed), truth = sampled(hidden, rejuvenated(heats)), hidden_exact[1]
+    """Of many seeds: a dozen have regions that are off by up to 0.038 and 0.017, by chance."""
+    (_, mixed), truth = sampled(hidden, rejuvenated(heats), seeds=4 * SEEDS), hidden_exact[1]
     for name in ("face", "yaw", "x", "y"):  # measured: at most 0.044
         assert total_variation(binned(name, mixed[name]), binned(name, getattr(truth, name))) < 0.06
-    assert (regions(mixed, truth) < [0.03, 0.015]).all()  # 0.018 and 0.0054
+    assert (regions(mixed, truth) < [0.03, 0.015]).all()  # 0.006 to 0.016 and 0.003 to 0.008, of four such runs
     before, after = (run(hidden, 0, PARTICLES, how).placement for how in (step(), rejuvenated(heats)))
     assert (before.x != after.x).mean() > 0.5
 
