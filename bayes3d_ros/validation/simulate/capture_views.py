@@ -36,9 +36,11 @@ def capture(
     T_table_object: Float[np.ndarray, "4 4"],
     views: int,
     pose_noise: tuple[float, float],
-    seed: int,
+    seed: int | tuple[int, ...],
+    distance: float = CAPTURE_DISTANCE,
 ) -> Captures:
-    """Evenly spread views, with sensor noise; poses are off by pose_noise (metres, radians)."""
+    """Evenly spread views, with sensor noise; poses are off by pose_noise (metres, radians). distance: of the camera
+    from the object's middle, metres."""
     noise = SensorNoise()
     bias_rng, pixel_rng, pose_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     bias = sample_bias_field(noise, bias_rng)
@@ -47,7 +49,7 @@ def capture(
     frames, seen = [], []
     for k in range(views):
         azimuth, pitch = 2 * np.pi * k / views + 0.2, np.radians(CAPTURE_PITCHES[k % len(CAPTURE_PITCHES)])
-        T_table_camera = look_at(middle + CAPTURE_DISTANCE * direction(azimuth - np.pi / 2, pitch), middle)
+        T_table_camera = look_at(middle + distance * direction(azimuth - np.pi / 2, pitch), middle)
         clean = perfect_depth(thing, T_table_object, T_table_camera)
         depth = add_sensor_noise(clean.depth, clean.cosine, REALSENSE, noise, bias, pixel_rng)
         returned = (clean.solid == 0) & (depth > 0)
