@@ -6,7 +6,8 @@ Every view votes on every voxel: for a surface where points fall into it, for fr
 something behind it; what a view's rays do not reach it says nothing of. Votes are log odds, so that flying pixels of
 one view, or one view whose pose is wrong, lose against the others. Planes are then fitted to the points of the voxels
 that won, after the points have been smoothed (`smooth.py`). Voxels that nobody saw count as solid inside the convex
-hull of the surface, but for those before all planes beside them, and are known to be unseen (`unseen.py`).
+hull of the surface, but for those before all planes beside them and those between free ones, and are known to be unseen
+(`unseen.py`).
 """
 
 from collections.abc import Sequence
@@ -40,7 +41,7 @@ from bayes3d_ros.learning.fusion_constants import (
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.smooth import smooth
 from bayes3d_ros.learning.tuning import TUNING
-from bayes3d_ros.learning.unseen import continued, down_to_table, nearest_planes, unseen_surface
+from bayes3d_ros.learning.unseen import between_free, continued, down_to_table, nearest_planes, unseen_surface
 
 
 class Fused(NamedTuple):
@@ -71,8 +72,9 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
     if not hits.any():
         raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
-    rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views]).sum(0)
-    passes, glimpses = rays.reshape(2, *grid.shape)
+    rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views])
+    rays = rays.reshape(len(views), 3, *grid.shape)
+    passes, glimpses, _ = rays.sum(0)
     surface = _pieces((hits > 0) & (HIT * hits - GLIMPSE * glimpses - (PASS - GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
@@ -94,9 +96,13 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (clear.voxel + 0.5) * voxel_size
     hull = _hull(centre + clear.normal * clear.offset[:, None])  # points would count with their noise
-    unknown = (hits + glimpses == 0) & _within(hull, grid)
+    unseen_by_all = (hits == 0) & ~(rays[:, 2] > 0).any(0)
+    unknown = unseen_by_all & _within(hull, grid)
+    cameras = np.array([view.T_table_camera[:3, 3] for view in views])
+    unknown &= ~between_free(unseen_by_all, (rays[:, 2] > 0) & ~surface, cameras, grid)
     where = np.argwhere(unknown)
     unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
+    unknown &= ndimage.binary_opening(held | behind | unknown, np.ones((2, 2, 2)))  # without crumbs
     solid = _pieces(held | behind | unknown)
     unseen = continued(unseen_surface(solid, held), clear, grid)
     counts = np.concatenate([hits[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
@@ -158,9 +164,10 @@ def _hits(surface: Surface, grid: VoxelGrid) -> Int[np.ndarray, "V"]:
 
 def _passed(
     centres: Float[np.ndarray, "V 3"], frame: DepthFrame, T_table_camera: Float[np.ndarray, "4 4"], voxel_size: float
-) -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "V"]]:
-    """1 for voxels through all of which this view's rays go on to something behind them; and 1 for those through whose
-    middle one does. The first is evidence against points seen in a voxel, the second enough where there are none."""
+) -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "V"], Int[np.ndarray, "V"]]:
+    """1 for voxels through all of which this view's rays go on to something behind them; for those through whose middle
+    one does; and for those through whose middle half any does. The first two are evidence against points seen in a
+    voxel, the third enough where there are none."""
     low = centres[:, 2] < LOW
     at = np.where(low[:, None], centres * [1, 1, 0], centres)  # of the lowest what counts is the table under them
     T = np.linalg.inv(T_table_camera)
@@ -179,10 +186,11 @@ def _passed(
         (depth > 0) & (heights < 0), depth - T_table_camera[2, 3] / np.maximum(-heights, 1e-9), -np.inf
     )
     around, middle = seen_there(ndimage.minimum_filter(depth, side)), seen_there(depth)
+    farthest = seen_there(ndimage.maximum_filter(depth, 2 * int(width / np.sqrt(3) / 4) + 1))
     table = seen_there(ndimage.minimum_filter(past_table, side)) > -BEHIND_VOXEL
     all_through = np.where(low, table, around > z + np.sqrt(3) / 2 * voxel_size + BEHIND_VOXEL)
-    through = middle > z + np.where(low, -BEHIND_VOXEL, voxel_size / 2 + BEHIND_VOXEL / 2)
-    return all_through.astype(int), through.astype(int)
+    behind = z + np.where(low, -BEHIND_VOXEL, voxel_size / 2 + BEHIND_VOXEL / 2)
+    return all_through.astype(int), (middle > behind).astype(int), (farthest > behind).astype(int)
 
 
 def _pieces(voxels: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.planes import Patches
 from bayes3d_ros.geometry.voxel_grid import VoxelGrid
-from bayes3d_ros.learning.fusion_constants import ALIKE, BELOW, BESIDE, CONTINUED, FOOT, STEEP
+from bayes3d_ros.learning.fusion_constants import ALIKE, BELOW, BESIDE, CONTINUED, FACING, FOOT, GAP, STEEP
 
 
 class UnseenPlanes(NamedTuple):
@@ -74,6 +74,47 @@ def _lowest(voxel: Int[np.ndarray, "W 3"], normal: Float[np.ndarray, "W 3"]) -> 
         lowest[one[along & (higher == 1)]] = False
         lowest[other[along & (higher == -1)]] = False
     return lowest
+
+
+def between_free(
+    unseen: Bool[np.ndarray, "X Y Z"],
+    free: Bool[np.ndarray, "N X Y Z"],
+    cameras: Float[np.ndarray, "N 3"],
+    grid: VoxelGrid,
+) -> Bool[np.ndarray, "X Y Z"]:
+    """Unseen voxels of a gap that views look into from both sides, such as that of a handle: along some horizontal
+    line there are at most GAP metres of unseen voxels, and at both ends free ones. A solid would show a face there to a
+    view that sees the free voxel and that the face is turned to.
+
+    free: voxels that are free in each of N views; cameras: where these stand, table frame.
+    """
+    centres = grid.centres()
+    found = np.zeros(grid.shape, bool)
+    ways = [np.array(step) for step in ((1, 0, 0), (1, 1, 0), (0, 1, 0), (-1, 1, 0))]
+    for way in ways:
+        most = int(GAP / (grid.voxel_size * np.linalg.norm(way)))
+        reached = []  # in how many steps an end is reached, both ways
+        for step in (way, -way):
+            facing = np.zeros(grid.shape, bool)
+            for one, camera in zip(free, cameras, strict=True):
+                away = camera - centres
+                cosine = away @ (step / np.linalg.norm(step)) / np.linalg.norm(away, axis=1)
+                facing |= one & (cosine > FACING).reshape(grid.shape)
+            steps = np.full(grid.shape, most + 1)
+            end = facing
+            for number in range(1, most + 1):
+                end = _moved(end, -step) & unseen & (steps > most)
+                steps[end] = number
+            reached.append(steps)
+        found |= unseen & (reached[0] + reached[1] - 1 <= most)
+    return found
+
+
+def _moved(voxels: Bool[np.ndarray, "X Y Z"], step: Int[np.ndarray, "3"]) -> Bool[np.ndarray, "X Y Z"]:
+    """Each voxel has the value of the one that lies a step before it; False beyond the borders."""
+    padded = np.pad(voxels, 1)
+    first = 1 - step
+    return padded[tuple(slice(f, f + n) for f, n in zip(first, voxels.shape, strict=True))]
 
 
 class NearestPlanes(NamedTuple):
