@@ -22,11 +22,12 @@ these are good, so that the product over cells is a density whatever it approxim
 
 A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is that given the cells: the
 mixture of `density.py` about the objects' surfaces d + phi . a_object, with a_object at the mode that the object's
-cells give it with scale 1 and, of the four pairs of noise, the one with the larger sigma and the smaller p_out. Each
-point of the mixture is as wide as its surface's errors make it (an object's: bias, w and b, their scale at most
-`WIDEST_EDGES`) and as likely as a blur of the image says (outlines of depth images are off by a part of a pixel, and
-alike along an object). A share of the density is for returns between the window's front and back, and, with probability
-pi, for returns up to `BAD_DEPTH` in front of an object.
+cells give it with scale 1 and, of the four pairs of noise, the one with the larger sigma and the smaller p_out. The
+table is a plane, so its points count where the pixel's own ray meets it. Each point of the mixture is as wide as its
+surface's errors make it (an object's: bias, w and b, their scale at most `WIDEST_EDGES`) and as likely as a blur of the
+image says (outlines of depth images are off by a part of a pixel, and alike along an object). A share of the density is
+for returns between the window's front and back, and, with probability pi, for returns up to `BAD_DEPTH` in front of an
+object.
 
 Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
 behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else

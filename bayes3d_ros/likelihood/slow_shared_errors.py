@@ -43,12 +43,12 @@ def log_edges(
     scale: float,
 ) -> Float[np.ndarray, "E"]:
     """log density of each edge pixel's return. depth: with the errors that objects' cells share; scale: of the
-    amplitudes of objects."""
+    amplitudes of objects. The table is a plane, so its points in a window count where the pixel's own ray meets it."""
     amplitudes, nodes = errors.amplitudes, errors.nodes
     sigma, p = float(nodes.sigma[node]), float(nodes.p_outlier[node])
     v, u = np.nonzero(edge)
     a, b = np.asarray(image.ray_x, np.float64)[u], np.asarray(image.ray_y, np.float64)[v]
-    observed = np.asarray(image.depth, np.float64)[v, u]
+    observed, bare = (np.asarray(part, np.float64)[v, u] for part in (image.depth, image.bare_depth))
     norm2, outlier = 1 + a * a + b * b, float(image.outlier_scale) * observed**2
     noise = sigma * errors.spread[v, u].astype(np.float64)
     of_object = float(amplitudes.bias) ** 2 + float(amplitudes.wave) ** 2 + float(amplitudes.model) ** 2
@@ -64,7 +64,8 @@ def log_edges(
         apart = np.where(surface, du**2 + dv**2, np.inf)
         across = np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf)
         variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
-        off = observed - y0 * (1 + (ex * a + ey * b) / norm2)
+        on_plane = (there == TABLE) & np.isfinite(bare)
+        off = observed - np.where(on_plane, bare, y0 * (1 + (ex * a + ey * b) / norm2))
         inlier = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
         window.append((apart, across, inlier, np.where(surface, y0, np.nan), there >= OBJECT))
     apart, across, inlier, points, of_objects = (np.array(part) for part in zip(*window, strict=True))

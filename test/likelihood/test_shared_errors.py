@@ -151,6 +151,33 @@ def _bare_image(depth=None, seed=0):
     return scored_image(CAMERA, np.where(kind > 0, depth, 0), kind, bare, NEAR, FAR, SIGMA_MAX), bare
 
 
+def test_a_return_of_the_table_beside_an_outline_counts_where_its_own_ray_meets_the_table():
+    """From row to row the table is 7 mm farther: the table's part of the window is that of the pixel's own ray, and
+    a return there has the table's density times that part."""
+    image, bare = _bare_image()
+    errors = _errors(SHIPPED._replace(edge_share=np.float32(0), bad_share=np.float32(0), unknown=np.False_), image)
+    row, column = 20, 40
+    label = np.ones(bare.shape, int)
+    label[row : row + 2, column - 1 : column + 2] = slow.OBJECT  # the pixel itself and what is below it and beside
+    depth = np.where(label == slow.OBJECT, 0.4, bare)
+    edge = np.zeros(bare.shape, bool)
+    edge[row, column] = True
+    assert abs(bare[row - 1, column] - bare[row, column]) > 0.007
+
+    def density(z):
+        moved = np.asarray(image.depth).copy()
+        moved[row, column] = z
+        return float(np.exp(slow.log_edges(depth, label, edge, image._replace(depth=moved), errors, 0, 1.0)[0]))
+
+    one = np.exp(-0.5 / float(SHIPPED.edge_blur) ** 2)
+    part = one / (1 + 2 * one)  # of the row above
+    x, y = float(image.ray_x[column]), float(image.ray_y[row])
+    sd = np.hypot(SIGMA * float(errors.spread[row, column]) / np.sqrt(1 + x * x + y * y), float(errors.nodes.table[1]))
+    peak = (1 - P) * part / (np.sqrt(2 * np.pi) * sd)
+    assert density(bare[row, column]) == pytest.approx(peak, rel=0.01)
+    assert density(bare[row - 1, column]) < 0.01 * peak
+
+
 @pytest.fixture(scope="module")
 def scene():
     """A brick and a tower on a table, one in front of the other, with a bias and a dent; unknown things behind and

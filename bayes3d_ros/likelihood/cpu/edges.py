@@ -32,6 +32,8 @@ class Edges(NamedTuple):
     norm2: Float[np.ndarray, "w"]
     spread: Float[np.ndarray, "w"]
     outlier: Float[np.ndarray, "w"]  # its density
+    past_table: Float[np.ndarray, "w"]  # metres that the return lies behind the table, along its ray
+    meets_table: Int[np.ndarray, "w"]  # whether its ray meets the table at all
     point: Float[np.ndarray, "K*w"]  # depth
     on_table: Float[np.ndarray, "K*w"]  # 1 or 0
     off: Float[np.ndarray, "K*w"]  # metres that the return lies behind a point, along the ray
@@ -54,9 +56,9 @@ def new_edges():
     one, all_points = np.ones(EDGES_SIDE_BY_SIDE, np.float32), np.ones(_POINTS * EDGES_SIDE_BY_SIDE, np.float32)
     whole = np.zeros(EDGES_SIDE_BY_SIDE, np.int32)
     return Edges(
-        whole, whole.copy(), one, one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), all_points,
-        all_points.copy(), all_points.copy(), all_points.copy(), all_points.copy(), one.copy(), one.copy(), one.copy(),
-        one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(),
+        whole, whole.copy(), one, one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), whole.copy(),
+        all_points, all_points.copy(), all_points.copy(), all_points.copy(), all_points.copy(), one.copy(), one.copy(),
+        one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(),
     )  # fmt: skip
 
 
@@ -69,6 +71,8 @@ def put_edge(edges, at, picture, returns, column, row, z, place, place_of_sum):
     edges.norm2[at] = f32(1.0) + x * x + y * y
     edges.spread[at] = returns.spread[row * returns.columns + column]
     edges.outlier[at] = picture.outlier_scale * z * z
+    bare = returns.bare[row * returns.columns + column]
+    edges.past_table[at], edges.meets_table[at] = z - bare, bare < NO_SURFACE_METRES
 
 
 @inlined
@@ -79,6 +83,7 @@ def _repeat_last(edges, used, full):
         edges.depth[k], edges.x[k], edges.y[k] = edges.depth[used - 1], edges.x[used - 1], edges.y[used - 1]
         edges.norm2[k], edges.spread[k] = edges.norm2[used - 1], edges.spread[used - 1]
         edges.outlier[k] = edges.outlier[used - 1]
+        edges.past_table[k], edges.meets_table[k] = edges.past_table[used - 1], edges.meets_table[used - 1]
 
 
 @fast
@@ -97,6 +102,7 @@ def _pick(edges, depth, label, stride, full):
 def _measure(edges, step_x, step_y, full):
     """How far the points of every window are from the return, and what surfaces the window shows."""
     z, x, y, norm2, point, on_table = edges.depth, edges.x, edges.y, edges.norm2, edges.point, edges.on_table
+    past_table, meets_table = edges.past_table, edges.meets_table
     off, across, nearest, least = edges.off, edges.across, edges.nearest, edges.least
     front, back, of_objects = edges.front, edges.back, edges.of_objects
     for k in range(u64(full)):
@@ -112,6 +118,8 @@ def _measure(edges, step_x, step_y, full):
             turned = ex * y[k] - ey * x[k]
             apart = d * d * (sides + turned * turned) * over
             behind = z[k] - d * (f32(1.0) + (ex * x[k] + ey * y[k]) * over)
+            on_plane = (on_table[to + k] > f32(0.0)) & (meets_table[k] != 0)
+            behind = past_table[k] if on_plane else behind  # a plane: where the pixel's own ray meets it
             across[to + k] = apart if real else f32(FAR_AWAY)
             off[to + k] = behind if real else f32(0.0)
             nearest[k] = lesser(nearest[k], apart if real else f32(FAR_AWAY))
