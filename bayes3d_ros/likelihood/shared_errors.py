@@ -23,11 +23,11 @@ these are good, so that the product over cells is a density whatever it approxim
 A pixel whose window shows several surfaces is an edge and belongs to no cell. Its density is that given the cells: the
 mixture of `density.py` about the objects' surfaces d + phi . a_object, with a_object at the mode that the object's
 cells give it with scale 1 and, of the four pairs of noise, the one with the larger sigma and the smaller p_out. The
-table is a plane, so its points count where the pixel's own ray meets it. Each point of the mixture is as wide as its
-surface's errors make it (an object's: bias, w and b, their scale at most `WIDEST_EDGES`) and as likely as a blur of the
-image says (outlines of depth images are off by a part of a pixel, and alike along an object). A share of the density is
-for returns between the window's front and back, and, with probability pi, for returns up to `BAD_DEPTH` in front of an
-object.
+table is a plane: its points count where the pixel's own ray meets it, and with `BLED_SHARE` at their own depth. Each
+point of the mixture is as wide as its surface's errors make it (an object's: bias, w and b, their scale at most
+`WIDEST_EDGES`) and as likely as a blur of the image says (outlines of depth images are off by a part of a pixel, and
+alike along an object). A share of the density is for returns between the window's front and back, and, with probability
+pi, for returns up to `BAD_DEPTH` in front of an object.
 
 Within two pixels of an outline a return is lost with probability `LOST_SHARE` edge_share: it lies up to `LOST_DEPTH`
 behind the surface (uniform), or beyond the workspace, since cameras blur outlines, and lose thin parts. Nothing else
@@ -66,6 +66,9 @@ TABLE_MARGIN_SDS = 5.0  # so many standard deviations of a return
 STEEPEST = 3.0  # metres of depth a metre across: a window that is steeper shows several surfaces
 # Scale of errors up to which edges are wider with it: a wrong type has large ones, and must fit outlines.
 WIDEST_EDGES = 1.0
+# Of the table's part of an edge's window: as likely as not a return there is bled, and has the depth of a pixel beside
+# it (stereo matching takes whole patches of the image together).
+BLED_SHARE = 0.5
 LOST_SHARE, LOST_DEPTH = 0.5, 0.3  # of `edge_share`; metres over which such returns are spread
 BLOCK_SIDE = 0.015  # metres at the reference depth: the table's median in the image
 LEAST_BLOCK = 2  # pixels

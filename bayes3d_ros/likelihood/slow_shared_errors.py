@@ -11,7 +11,14 @@ from scipy.special import logsumexp
 
 from bayes3d_ros.likelihood.density import LATERAL
 from bayes3d_ros.likelihood.scored_image import ScoredImage
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, WIDEST_EDGES, SharedErrorImage
+from bayes3d_ros.likelihood.shared_errors import (
+    BAD_DEPTH,
+    BLED_SHARE,
+    LOST_DEPTH,
+    LOST_SHARE,
+    WIDEST_EDGES,
+    SharedErrorImage,
+)
 from bayes3d_ros.likelihood.slow_cells import SurfaceCells, cells_of, lost_density, modes_at_nodes
 from bayes3d_ros.likelihood.slow_object_cells import (
     ObjectErrors,
@@ -43,7 +50,8 @@ def log_edges(
     scale: float,
 ) -> Float[np.ndarray, "E"]:
     """log density of each edge pixel's return. depth: with the errors that objects' cells share; scale: of the
-    amplitudes of objects. The table is a plane, so its points in a window count where the pixel's own ray meets it."""
+    amplitudes of objects. The table is a plane: its points in a window count where the pixel's own ray meets it, and
+    with `BLED_SHARE` where they are."""
     amplitudes, nodes = errors.amplitudes, errors.nodes
     sigma, p = float(nodes.sigma[node]), float(nodes.p_outlier[node])
     v, u = np.nonzero(edge)
@@ -65,8 +73,9 @@ def log_edges(
         across = np.where(surface, y0**2 * (ex**2 + ey**2 + (ex * b - ey * a) ** 2) / norm2, np.inf)
         variance = noise**2 / norm2 + np.where(there == TABLE, of_table, of_object)
         on_plane = (there == TABLE) & np.isfinite(bare)
-        off = observed - np.where(on_plane, bare, y0 * (1 + (ex * a + ey * b) / norm2))
-        inlier = np.exp(-0.5 * off**2 / variance) / np.sqrt(2 * np.pi * variance)
+        off, own = observed - y0 * (1 + (ex * a + ey * b) / norm2), observed - np.where(on_plane, bare, 0)
+        inlier, of_own = (np.exp(-0.5 * d**2 / variance) / np.sqrt(2 * np.pi * variance) for d in (off, own))
+        inlier = np.where(on_plane, BLED_SHARE * inlier + (1 - BLED_SHARE) * of_own, inlier)
         window.append((apart, across, inlier, np.where(surface, y0, np.nan), there >= OBJECT))
     apart, across, inlier, points, of_objects = (np.array(part) for part in zip(*window, strict=True))
     any_surface = np.isfinite(points).any(0)

@@ -17,7 +17,7 @@ from bayes3d_ros.likelihood.image_model import gain, log_marginal, shared_errors
 from bayes3d_ros.likelihood.own_plane import own_plane_log_density
 from bayes3d_ros.likelihood.scene_score import log_likelihood_scene, pad_scene, render_objects
 from bayes3d_ros.likelihood.scored_image import scored_image
-from bayes3d_ros.likelihood.shared_errors import Amplitudes, shared_error_image
+from bayes3d_ros.likelihood.shared_errors import BLED_SHARE, Amplitudes, shared_error_image
 from bayes3d_ros.objects.library_arrays import library_arrays
 from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.model import Library
@@ -153,7 +153,7 @@ def _bare_image(depth=None, seed=0):
 
 def test_a_return_of_the_table_beside_an_outline_counts_where_its_own_ray_meets_the_table():
     """From row to row the table is 7 mm farther: the table's part of the window is that of the pixel's own ray, and
-    a return there has the table's density times that part."""
+    a return there has the table's density times that part; half of it is for what is bled from beside."""
     image, bare = _bare_image()
     errors = _errors(SHIPPED._replace(edge_share=np.float32(0), bad_share=np.float32(0), unknown=np.False_), image)
     row, column = 20, 40
@@ -173,9 +173,10 @@ def test_a_return_of_the_table_beside_an_outline_counts_where_its_own_ray_meets_
     part = one / (1 + 2 * one)  # of the row above
     x, y = float(image.ray_x[column]), float(image.ray_y[row])
     sd = np.hypot(SIGMA * float(errors.spread[row, column]) / np.sqrt(1 + x * x + y * y), float(errors.nodes.table[1]))
-    peak = (1 - P) * part / (np.sqrt(2 * np.pi) * sd)
+    peak = (1 - P) * (1 - BLED_SHARE) * part / (np.sqrt(2 * np.pi) * sd)
     assert density(bare[row, column]) == pytest.approx(peak, rel=0.01)
-    assert density(bare[row - 1, column]) < 0.01 * peak
+    assert 0.5 * peak < density(bare[row - 1, column]) < peak  # bled from the row above
+    assert density((bare[row - 1, column] + bare[row, column]) / 2) < 0.1 * peak
 
 
 @pytest.fixture(scope="module")

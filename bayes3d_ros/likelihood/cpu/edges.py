@@ -14,7 +14,7 @@ from bayes3d_ros.likelihood.cpu.packing import larger, lesser
 from bayes3d_ros.likelihood.cpu.patches import TABLE
 from bayes3d_ros.likelihood.cpu.windows import exp, log
 from bayes3d_ros.likelihood.density import FAR_AWAY, LATERAL
-from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, LOST_DEPTH, LOST_SHARE, WIDEST_EDGES
+from bayes3d_ros.likelihood.shared_errors import BAD_DEPTH, BLED_SHARE, LOST_DEPTH, LOST_SHARE, WIDEST_EDGES
 
 EDGES_SIDE_BY_SIDE = 64
 _POINTS = 9  # of a window
@@ -33,7 +33,7 @@ class Edges(NamedTuple):
     spread: Float[np.ndarray, "w"]
     outlier: Float[np.ndarray, "w"]  # its density
     past_table: Float[np.ndarray, "w"]  # metres that the return lies behind the table, along its ray
-    meets_table: Int[np.ndarray, "w"]  # whether its ray meets the table at all
+    on_own_ray: Float[np.ndarray, "w"]  # share of the table's part that counts there; 0: the ray meets no table
     point: Float[np.ndarray, "K*w"]  # depth
     on_table: Float[np.ndarray, "K*w"]  # 1 or 0
     off: Float[np.ndarray, "K*w"]  # metres that the return lies behind a point, along the ray
@@ -56,7 +56,7 @@ def new_edges():
     one, all_points = np.ones(EDGES_SIDE_BY_SIDE, np.float32), np.ones(_POINTS * EDGES_SIDE_BY_SIDE, np.float32)
     whole = np.zeros(EDGES_SIDE_BY_SIDE, np.int32)
     return Edges(
-        whole, whole.copy(), one, one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), whole.copy(),
+        whole, whole.copy(), one, one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(),
         all_points, all_points.copy(), all_points.copy(), all_points.copy(), all_points.copy(), one.copy(), one.copy(),
         one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(), one.copy(),
     )  # fmt: skip
@@ -72,7 +72,8 @@ def put_edge(edges, at, picture, returns, column, row, z, place, place_of_sum):
     edges.spread[at] = returns.spread[row * returns.columns + column]
     edges.outlier[at] = picture.outlier_scale * z * z
     bare = returns.bare[row * returns.columns + column]
-    edges.past_table[at], edges.meets_table[at] = z - bare, bare < NO_SURFACE_METRES
+    edges.past_table[at] = z - bare
+    edges.on_own_ray[at] = f32(1 - BLED_SHARE) if bare < f32(NO_SURFACE_METRES) else f32(0.0)
 
 
 @inlined
@@ -83,7 +84,7 @@ def _repeat_last(edges, used, full):
         edges.depth[k], edges.x[k], edges.y[k] = edges.depth[used - 1], edges.x[used - 1], edges.y[used - 1]
         edges.norm2[k], edges.spread[k] = edges.norm2[used - 1], edges.spread[used - 1]
         edges.outlier[k] = edges.outlier[used - 1]
-        edges.past_table[k], edges.meets_table[k] = edges.past_table[used - 1], edges.meets_table[used - 1]
+        edges.past_table[k], edges.on_own_ray[k] = edges.past_table[used - 1], edges.on_own_ray[used - 1]
 
 
 @fast
@@ -102,7 +103,6 @@ def _pick(edges, depth, label, stride, full):
 def _measure(edges, step_x, step_y, full):
     """How far the points of every window are from the return, and what surfaces the window shows."""
     z, x, y, norm2, point, on_table = edges.depth, edges.x, edges.y, edges.norm2, edges.point, edges.on_table
-    past_table, meets_table = edges.past_table, edges.meets_table
     off, across, nearest, least = edges.off, edges.across, edges.nearest, edges.least
     front, back, of_objects = edges.front, edges.back, edges.of_objects
     for k in range(u64(full)):
@@ -118,8 +118,6 @@ def _measure(edges, step_x, step_y, full):
             turned = ex * y[k] - ey * x[k]
             apart = d * d * (sides + turned * turned) * over
             behind = z[k] - d * (f32(1.0) + (ex * x[k] + ey * y[k]) * over)
-            on_plane = (on_table[to + k] > f32(0.0)) & (meets_table[k] != 0)
-            behind = past_table[k] if on_plane else behind  # a plane: where the pixel's own ray meets it
             across[to + k] = apart if real else f32(FAR_AWAY)
             off[to + k] = behind if real else f32(0.0)
             nearest[k] = lesser(nearest[k], apart if real else f32(FAR_AWAY))
@@ -167,18 +165,22 @@ def _mix(edges, sigma, of_table, of_object, full):
         edges.precision_object,
     )
     off, on_table, weight, total, weights = edges.off, edges.on_table, edges.weight, edges.total, edges.weights
+    past_table, on_own_ray, value = edges.past_table, edges.on_own_ray, edges.value
     for k in range(u64(full)):
         noise = sigma * spread[k]
         noise2 = noise * noise / norm2[k]
         precision_table[k] = f32(1.0) / (noise2 + of_table)
         precision_object[k] = f32(1.0) / (noise2 + of_object)
         total[k], weights[k] = f32(0.0), f32(0.0)
+        own = f32(-0.5) * past_table[k] * past_table[k] * precision_table[k]
+        value[k] = exp(own) * np.sqrt(precision_table[k] * f32(1 / (2 * np.pi)))
     for number in range(_POINTS):
         to = u64(number * EDGES_SIDE_BY_SIDE)
         for k in range(u64(full)):
             table, away, share = on_table[to + k], off[to + k], weight[to + k]
             precision = table * precision_table[k] + (f32(1.0) - table) * precision_object[k]
             density = exp(f32(-0.5) * away * away * precision) * np.sqrt(precision * f32(1 / (2 * np.pi)))
+            density += table * on_own_ray[k] * (value[k] - density)
             total[k] += share * density
             weights[k] += share
 
