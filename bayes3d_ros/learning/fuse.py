@@ -29,6 +29,7 @@ from bayes3d_ros.geometry.voxels import SecondPlanes, VoxelSolid, two_planes
 from bayes3d_ros.learning.fusion_constants import (
     BEHIND_VOXEL,
     BEHIND_WALL,
+    BESIDE_CRUMBS,
     FACING,
     FEWEST_VOXELS,
     FOOT,
@@ -102,7 +103,8 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     unknown &= ~between_free(unseen_by_all, (rays[:, 2] > 0) & ~surface, cameras, grid)
     where = np.argwhere(unknown)
     unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
-    unknown &= ndimage.binary_opening(held | behind | unknown, np.ones((2, 2, 2)))  # without crumbs
+    beside = ndimage.correlate((held | behind | unknown).astype(int), np.ones((3, 3, 3), int), mode="constant")
+    unknown &= beside > BESIDE_CRUMBS
     solid = _pieces(held | behind | unknown)
     unseen = continued(unseen_surface(solid, held), clear, grid)
     counts = np.concatenate([hits[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
