@@ -97,14 +97,17 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (clear.voxel + 0.5) * voxel_size
     hull = _hull(centre + clear.normal * clear.offset[:, None])  # points would count with their noise
-    unseen_by_all = (hits == 0) & ~(rays[:, 2] > 0).any(0)
+    several = len(views) > 1  # what one view hides stays closed by the hull
+    passed = rays[:, 2 if several else 1] > 0
+    unseen_by_all = (hits == 0) & ~passed.any(0)
     unknown = unseen_by_all & _within(hull, grid)
     cameras = np.array([view.T_table_camera[:3, 3] for view in views])
-    unknown &= ~between_free(unseen_by_all, (rays[:, 2] > 0) & ~surface, cameras, grid)
+    unknown &= ~between_free(unseen_by_all, passed & ~surface, cameras, grid)
     where = np.argwhere(unknown)
     unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
-    beside = ndimage.correlate((held | behind | unknown).astype(int), np.ones((3, 3, 3), int), mode="constant")
-    unknown &= beside > BESIDE_CRUMBS
+    if several:
+        beside = ndimage.correlate((held | behind | unknown).astype(int), np.ones((3, 3, 3), int), mode="constant")
+        unknown &= beside > BESIDE_CRUMBS
     solid = _pieces(held | behind | unknown)
     unseen = continued(unseen_surface(solid, held), clear, grid)
     counts = np.concatenate([hits[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
