@@ -97,15 +97,9 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     behind[tuple(patches.voxel[noise].T)] = patches.offset[noise] > 0
     centre = grid.origin + (clear.voxel + 0.5) * voxel_size
     hull = _hull(centre + clear.normal * clear.offset[:, None])  # points would count with their noise
-    several = len(views) > 1  # what one view hides stays closed by the hull
-    passed = rays[:, 2 if several else 1] > 0
-    unseen_by_all = (hits == 0) & ~passed.any(0)
-    unknown = unseen_by_all & _within(hull, grid)
     cameras = np.array([view.T_table_camera[:3, 3] for view in views])
-    unknown &= ~between_free(unseen_by_all, passed & ~surface, cameras, grid)
-    where = np.argwhere(unknown)
-    unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
-    if several:
+    unknown = _unknown(hits, rays, surface, clear, cameras, grid) & _within(hull, grid)
+    if len(views) > 1:
         beside = ndimage.correlate((held | behind | unknown).astype(int), np.ones((3, 3, 3), int), mode="constant")
         unknown &= beside > BESIDE_CRUMBS
     solid = _pieces(held | behind | unknown)
@@ -117,6 +111,25 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     order = np.argsort(grid.flat(voxel))
     surface_of = VoxelSolid(voxel_size, grid.origin, solid, voxel[order], normal[order], offset[order], *second)
     return Fused(surface_of, counts[order], hull.points[hull.vertices])
+
+
+def _unknown(
+    hits: Int[np.ndarray, "X Y Z"],
+    rays: Int[np.ndarray, "N 3 X Y Z"],
+    surface: Bool[np.ndarray, "X Y Z"],
+    clear: Patches,
+    cameras: Float[np.ndarray, "N 3"],
+    grid: VoxelGrid,
+) -> Bool[np.ndarray, "X Y Z"]:
+    """Voxels of which the views tell neither that they are surface nor that they are free. rays: see `_passed`; clear:
+    planes of the surface. What one view hides is all unknown but for what its rays pass in the middle."""
+    several = len(rays) > 1
+    passed = rays[:, 2 if several else 1] > 0
+    unseen = (hits == 0) & ~passed.any(0)
+    unknown = unseen & ~between_free(unseen, passed & ~surface, cameras, grid) if several else unseen
+    where = np.argwhere(unknown)
+    unknown[tuple(where[nearest_planes(where, clear, grid).ahead].T)] = False  # the views looked through it
+    return unknown
 
 
 def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:

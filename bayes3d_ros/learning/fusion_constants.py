@@ -52,9 +52,7 @@ HIT, PASS, GLIMPSE = 2.5, 3.0, 1.0
 BEHIND_VOXEL = 0.004  # metres, beside the voxel's own size, that a return lies behind a voxel that its ray passed
 LOW = 0.012  # metres: voxels so near to the table are free where the table is seen under them
 FEWEST_VOXELS = 4  # of a piece that is kept
-BESIDE_CRUMBS = (
-    6  # voxels of the solid about a voxel that nobody saw, with itself, at most, where it is a crumb and free
-)
+BESIDE_CRUMBS = 6  # voxels of the solid about an unseen one, with itself, at most, where that is a crumb and free
 FOOT = 0.015  # metres: what is so near the lowest return, and walls so near the table, reach down to the table
 STEEP = 0.5  # cosine between a wall's normal and the vertical, at most: it goes on down to the table
 BELOW, BESIDE = 2.5, 0.3  # voxels to the lower part of a wall, at most: across the table; along the wall

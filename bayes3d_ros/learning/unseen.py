@@ -88,26 +88,31 @@ def between_free(
 
     free: voxels that are free in each of N views; cameras: where these stand, table frame.
     """
-    centres = grid.centres()
+    ways = np.array([(1, 0, 0), (1, 1, 0), (0, 1, 0), (-1, 1, 0)])
+    steps = np.concatenate([ways, -ways])
+    length = np.linalg.norm(steps, axis=1)
+    centres, facing = grid.centres(), np.zeros((len(steps), *grid.shape), bool)
+    for one, camera in zip(free, cameras, strict=True):
+        away = camera - centres
+        cosine = away @ (steps / length[:, None]).T / np.linalg.norm(away, axis=1, keepdims=True)
+        facing |= one & (cosine > FACING).T.reshape(facing.shape)
+    most = (GAP / (grid.voxel_size * length)).astype(int)
+    reached = [_steps_to(*each, unseen) for each in zip(facing, steps, most, strict=True)]
     found = np.zeros(grid.shape, bool)
-    ways = [np.array(step) for step in ((1, 0, 0), (1, 1, 0), (0, 1, 0), (-1, 1, 0))]
-    for way in ways:
-        most = int(GAP / (grid.voxel_size * np.linalg.norm(way)))
-        reached = []  # in how many steps an end is reached, both ways
-        for step in (way, -way):
-            facing = np.zeros(grid.shape, bool)
-            for one, camera in zip(free, cameras, strict=True):
-                away = camera - centres
-                cosine = away @ (step / np.linalg.norm(step)) / np.linalg.norm(away, axis=1)
-                facing |= one & (cosine > FACING).reshape(grid.shape)
-            steps = np.full(grid.shape, most + 1)
-            end = facing
-            for number in range(1, most + 1):
-                end = _moved(end, -step) & unseen & (steps > most)
-                steps[end] = number
-            reached.append(steps)
-        found |= unseen & (reached[0] + reached[1] - 1 <= most)
+    for one_way, back, limit in zip(reached[: len(ways)], reached[len(ways) :], most[: len(ways)], strict=True):
+        found |= unseen & (one_way + back - 1 <= limit)
     return found
+
+
+def _steps_to(
+    end: Bool[np.ndarray, "X Y Z"], step: Int[np.ndarray, "3"], most: int, unseen: Bool[np.ndarray, "X Y Z"]
+) -> Int[np.ndarray, "X Y Z"]:
+    """In how many steps, through unseen voxels alone, each of them reaches an end; most + 1: in more than `most`."""
+    steps = np.full(end.shape, most + 1)
+    for number in range(1, most + 1):
+        end = _moved(end, -step) & unseen & (steps > most)
+        steps[end] = number
+    return steps
 
 
 def _moved(voxels: Bool[np.ndarray, "X Y Z"], step: Int[np.ndarray, "3"]) -> Bool[np.ndarray, "X Y Z"]:

@@ -198,8 +198,8 @@ def test_errors_that_pixels_share():
     problem = PROBLEMS["block, shared"]()
     found = enumerate_object(problem)
     assert abs(found.log_evidence[-2] - found.log_evidence[-3]) < 0.02  # the last halving
-    # Random points of cells, not their middles: seen 0.031; with seven other seeds 0.010 to 0.020, and 0.111 once.
-    assert abs(found.log_evidence[-1] - found.log_evidence[-2]) < 0.035
+    # Random points of cells, not their middles: seen 0.004.
+    assert abs(found.log_evidence[-1] - found.log_evidence[-2]) < 0.03
     truth = found.marginals(problem)
     runs = [run(problem, seed, PARTICLES) for seed in range(4)]
     log_z = np.array([r.log_evidence[-1] for r in runs])
