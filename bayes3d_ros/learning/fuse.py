@@ -27,6 +27,7 @@ from bayes3d_ros.geometry.planes import Patches, fit_planes
 from bayes3d_ros.geometry.voxel_grid import VoxelGrid
 from bayes3d_ros.geometry.voxels import SecondPlanes, VoxelSolid, two_planes
 from bayes3d_ros.learning.fusion_constants import (
+    ALIKE,
     BEHIND_VOXEL,
     BEHIND_WALL,
     BESIDE_CRUMBS,
@@ -37,8 +38,10 @@ from bayes3d_ros.learning.fusion_constants import (
     HIT,
     LOW,
     PASS,
+    SHARPER,
     THIN,
 )
+from bayes3d_ros.learning.revolution import Body, body_of_revolution, hollow
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.smooth import smooth
 from bayes3d_ros.learning.tuning import TUNING
@@ -67,10 +70,11 @@ class Seen(NamedTuple):
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
-    views = _smoothed(views, voxel_size)
+    views, every, body = _smoothed(views, voxel_size)
     grid = _grid([view.surface for view in views], voxel_size)
     centres = grid.centres()
-    hits = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
+    seen = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
+    hits = np.maximum(seen, _hits(every, grid).reshape(grid.shape))  # a body of revolution goes on where none is seen
     if not hits.any():
         raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views])
@@ -79,7 +83,7 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     surface = _pieces((hits > 0) & (HIT * hits - GLIMPSE * glimpses - (PASS - GLIMPSE) * passes > 0))
     if not surface.any():
         raise FusionError("the views contradict each other: every voxel of a surface is seen through by other views")
-    points, normals = (np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True))
+    points, normals = every
     index = grid.flat(grid.cells(points))
     kept = surface.ravel()[index]
     points, normals, index = points[kept], normals[kept], index[kept]
@@ -99,12 +103,14 @@ def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     hull = _hull(centre + clear.normal * clear.offset[:, None])  # points would count with their noise
     cameras = np.array([view.T_table_camera[:3, 3] for view in views])
     unknown = _unknown(hits, rays, surface, clear, cameras, grid) & _within(hull, grid)
+    if body is not None:
+        unknown &= ~hollow(body, (rays[:, 2] > 0).any(0) & ~surface, surface, grid)
     if len(views) > 1:
         beside = ndimage.correlate((held | behind | unknown).astype(int), np.ones((3, 3, 3), int), mode="constant")
         unknown &= beside > BESIDE_CRUMBS
     solid = _pieces(held | behind | unknown)
     unseen = continued(unseen_surface(solid, held), clear, grid)
-    counts = np.concatenate([hits[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
+    counts = np.concatenate([seen[tuple(clear.voxel.T)], np.zeros(len(walls.voxel) + len(unseen.voxel), int)])
     voxel, normal, offset = (
         np.concatenate([getattr(part, key) for part in (front, walls, unseen)]) for key in ("voxel", "normal", "offset")
     )
@@ -132,12 +138,23 @@ def _unknown(
     return unknown
 
 
-def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:
-    """What all views show together, without the noise of single pixels."""
+def _smoothed(views: Sequence[Seen], voxel_size: float) -> tuple[list[Seen], Surface, Body | None]:
+    """The views without the noise of single pixels, and what they show together: of a body of revolution that several
+    views show, points all round."""
     every = Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
+    several = len(views) > 1
+    for alike in (ALIKE, SHARPER) if several else (ALIKE,):
+        every = smooth(every, voxel_size, alike)
+    body = body_of_revolution(every) if several else None
+    whole = every
+    if body is not None:
+        every = body.surface
+        whole = Surface(
+            *(np.concatenate([part[~body.own], own]) for part, own in zip(every, body.samples, strict=True))
+        )
     ends = np.cumsum([len(view.surface.points) for view in views])[:-1]
-    parts = zip(*(np.split(part, ends) for part in smooth(every, voxel_size)), strict=True)
-    return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)]
+    parts = zip(*(np.split(part, ends) for part in every), strict=True)
+    return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)], whole, body
 
 
 def _steeper(front: Patches, second: SecondPlanes, grid: VoxelGrid) -> Patches:

@@ -18,7 +18,8 @@ FEWEST_PIXELS = 60  # that make a thing
 SWELL = 1.5  # times the least height of a thing's returns: what nowhere rises above it is a swell of the table
 FIRM = 0.6  # share of the returns around a pixel that rise as well where it is more than a speck of noise
 FOOT_WITHIN = 0.04  # metres: what is not seen to reach down so far does not stand on the table, but flies or is held
-NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways
+NORMAL_RADIUS = 0.004  # metres of surface that a normal is fitted to, both ways, where views are aligned
+EDGE_RADIUS = 0.002  # the same where they are fused: of a wall's top, 3.5 mm wide, 4 mm leave no normal but its sides'
 # Metres beyond the setting `max_shift`, by which a view's camera pose may be off, from the place that is asked for to
 # the nearest return of the thing there, and from a thing in one view to the same thing in another.
 PLACE_ERROR = 0.02
@@ -43,8 +44,24 @@ LEAST_CELL = 0.0015  # metres: points in cubes of half a voxel, at least this, a
 WIDTHS = 0.002, 0.003, 0.0045, 0.0065  # metres: standard deviations of the weights that a surface is fitted with
 REACH = 2.0  # such widths: points farther off do not count
 ALIKE = 0.7  # cosine between normals of one side; also of voxels of one wall (`unseen.py`)
+# Likewise where points are smoothed again, with the normals of the first fits: beside an edge those are of one side.
+SHARPER = 0.9
 AGREE = 2.0  # standard errors: a wider fit is taken where intervals of so many about it and all narrower ones meet
 FEWEST_CELLS = 12  # that a fit needs
+
+# Bodies of revolution (`revolution.py`)
+SECTORS, FACINGS = 36, 16  # of azimuth; of directions across the profile
+PROFILE_CELL, PROFILE_WIDTH = 0.001, 0.003  # metres: cells of the profile; standard deviation of a fit's weights
+ONE_CURVE = 0.9  # cosine between normals of one curve, at least
+PAST_EDGE = 0.0002  # metres above another side, where a side ends at an edge
+UPRIGHT_TURN = 0.35  # sine of the angle by which a normal of the body misses the plane through its axis, at most
+# Metres from the curve at which points agree with it: three standard deviations of what is seen all round, from the
+# first to the second.
+ROUND_WITHIN = 0.0003, 0.0008
+AROUND, AGREEING = 1 / 3, 0.8  # shares that agree: of the circle, of what is seen of it
+HOLLOW = 1 / 12  # share of a ring's voxels that are free where all of it inside the body is
+BESIDE_BODY = 0.012  # metres about the body in which other points speak against it
+NEAR_BODY = 0.004  # metres from points of the body in which other points have to be nearer than half of that to do so
 
 # Votes on voxels (`fuse.py`)
 # Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.

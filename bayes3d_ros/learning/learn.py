@@ -15,7 +15,7 @@ from bayes3d_ros.geometry.depth_frame import DepthFrame, sees_beyond
 from bayes3d_ros.geometry.farthest_points import farthest_first
 from bayes3d_ros.learning.align import align_views, moved, residual_between
 from bayes3d_ros.learning.fuse import Fused, FusionError, Seen, fuse
-from bayes3d_ros.learning.fusion_constants import CONTRADICTED, PLACE_ERROR, SEEN_THROUGH
+from bayes3d_ros.learning.fusion_constants import CONTRADICTED, EDGE_RADIUS, NORMAL_RADIUS, PLACE_ERROR, SEEN_THROUGH
 from bayes3d_ros.learning.segment import (
     Surface,
     Thing,
@@ -100,7 +100,7 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
         refused = {k: part for k, part in enumerate(parts) if isinstance(part, str)}
         things, missing = choose_things(views, settings)
         refused |= missing
-        oriented = pool.map(lambda k: surface(views[k], things[k]), things)
+        oriented = pool.map(lambda k: surface(views[k], things[k], NORMAL_RADIUS), things)
         surfaces = dict(zip(things, oriented, strict=True))
     while True:
         if not surfaces:
@@ -115,8 +115,10 @@ def learn(frames: Sequence[DepthFrame], name: str, settings: LearnerSettings | N
             break
         refused[worst] = why
         del surfaces[worst]
+    # Normals of few pixels keep edges; those of a single view are averaged with no other's.
+    sharp = {k: moved(surface(views[k], things[k], EDGE_RADIUS), shifts[k]) for k in used} if len(used) > 1 else aligned
     try:
-        fused = fuse([Seen(aligned[k], frames[k], poses[k]) for k in used], settings.voxel_size)
+        fused = fuse([Seen(sharp[k], frames[k], poses[k]) for k in used], settings.voxel_size)
     except FusionError as error:
         raise LearningError(str(error)) from None
     reports = tuple(

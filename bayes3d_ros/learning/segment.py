@@ -19,7 +19,6 @@ from bayes3d_ros.learning.fusion_constants import (
     FIRM,
     FOOT_WITHIN,
     LOWEST,
-    NORMAL_RADIUS,
     PIXELS_A_VOXEL,
     SWELL,
     TABLE_AREA,
@@ -134,10 +133,10 @@ def _cut_by(
     return next((words for words, where in left_out.by if (beside & where[part]).any()), "")
 
 
-def surface(view: View, thing: Thing) -> Surface:
-    """With normals of planes fitted to what the thing shows around each of its pixels."""
+def surface(view: View, thing: Thing, radius: float) -> Surface:
+    """With normals of planes fitted to what the thing shows around each of its pixels, so many metres both ways."""
     distance = float(np.median(view.frame.depth[thing.pixels]))
-    side = 2 * int(np.clip(round(NORMAL_RADIUS * view.frame.intrinsics.fx / distance), 2, 8)) + 1
+    side = 2 * int(np.clip(round(radius * view.frame.intrinsics.fx / distance), 2, 8)) + 1
     rows, columns = thing.pixels
     at = rows - rows.min(), columns - columns.min()
     shape = at[0].max() + 1, at[1].max() + 1

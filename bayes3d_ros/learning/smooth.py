@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from bayes3d_ros.learning.fusion_constants import AGREE, ALIKE, FEWEST_CELLS, LEAST_CELL, REACH, WIDTHS
+from bayes3d_ros.learning.fusion_constants import AGREE, FEWEST_CELLS, LEAST_CELL, REACH, WIDTHS
 from bayes3d_ros.learning.segment import Surface
 
 _CENTRES = 1024  # at once, which bounds memory
@@ -43,9 +43,10 @@ class _Fits(NamedTuple):
     cells: Int[np.ndarray, "C"]  # how many
 
 
-def smooth(surface: Surface, voxel_size: float) -> Surface:
+def smooth(surface: Surface, voxel_size: float, alike: float) -> Surface:
     """The same points, moved along their normals onto the surface, with its normals. Points with few others about them
-    stay where they are. Normals are unit vectors."""
+    stay where they are. Normals are unit vectors; points are fitted to those about them whose normals have at least the
+    cosine `alike` with theirs."""
     cells = _cells(surface, max(voxel_size / 2, LEAST_CELL))
     tree, count = cKDTree(cells.middle), len(cells.points)
     columns = (cells.middle - cells.middle.mean(0), cells.normal, cells.points, cells.along)
@@ -54,7 +55,7 @@ def smooth(surface: Surface, voxel_size: float) -> Surface:
     fitted, wider = np.zeros(count, bool), np.ones(count, bool)
     noise = None
     for width in WIDTHS:
-        fits = _fit(halved, tree, width)
+        fits = _fit(halved, tree, width, alike)
         enough = fits.cells >= FEWEST_CELLS
         if noise is None and enough.mean() > 0.5:  # of one point, as the narrowest fits see it that have cells enough
             spare = fits.cells[enough] / (fits.cells[enough] - len(_POWERS))
@@ -91,7 +92,7 @@ def _cells(surface: Surface, side: float) -> _Cells:
     return _Cells(of_point, mean(points), normal, count.astype(float), along)
 
 
-def _fit(cells: _Cells, tree: cKDTree, width: float) -> _Fits:
+def _fit(cells: _Cells, tree: cKDTree, width: float, alike: float) -> _Fits:
     """tree: of the cells' middles; width: standard deviation of the Gaussian weight about each cell, metres."""
     count = len(cells.points)
 
@@ -99,9 +100,9 @@ def _fit(cells: _Cells, tree: cKDTree, width: float) -> _Fits:
         centres = np.arange(start, min(start + _CENTRES, count))
         near = tree.query_ball_point(tree.data[centres], REACH * width)
         own, other = np.repeat(centres, [len(one) for one in near]), np.concatenate(near).astype(int)
-        alike = np.einsum("pj,pj->p", cells.normal[own], cells.normal[other]) > ALIKE
-        number = np.bincount(own[alike] - start, minlength=len(centres))  # each is its own neighbour: at least one
-        return _fit_about(cells, width, own[alike], other[alike], number)
+        same = np.einsum("pj,pj->p", cells.normal[own], cells.normal[other]) > alike
+        number = np.bincount(own[same] - start, minlength=len(centres))  # each is its own neighbour: at least one
+        return _fit_about(cells, width, own[same], other[same], number)
 
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter
         parts = list(pool.map(fits_from, range(0, count, _CENTRES)))

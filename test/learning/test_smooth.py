@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from bayes3d_ros.learning.fusion_constants import ALIKE
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.smooth import smooth
 
@@ -22,7 +23,7 @@ def can(noise: float, radius: float = 0.045) -> Surface:
 
 
 def test_noise_goes_and_the_radius_stays():
-    points, normals = smooth(can(0.0006), 0.004)
+    points, normals = smooth(can(0.0006), 0.004, ALIKE)
     inside = np.abs(points[:, 2] - 0.04) < 0.03
     off = np.hypot(points[inside, 0], points[inside, 1]) - 0.045
     assert abs(off.mean()) < 1e-5 and off.std() < 1e-4
@@ -32,7 +33,7 @@ def test_noise_goes_and_the_radius_stays():
 
 def test_without_noise_a_round_side_stays_where_it_is():
     before = can(0.0)
-    points, normals = smooth(before, 0.004)
+    points, normals = smooth(before, 0.004, ALIKE)
     assert np.linalg.norm(points - before.points, axis=1).max() < 3e-5
     assert np.einsum("ij,ij->i", normals, before.normals).min() > np.cos(np.radians(2))
 
@@ -48,7 +49,7 @@ def test_an_edge_stays_sharp():
     noise = 0.0003 * np.random.default_rng(1).normal(size=(2, len(u), 1))
     truth = np.concatenate([top, front])
     noisy = np.concatenate([top + noise[0] * [0, 0, 1], front + noise[1] * [1, 0, 0]])
-    points, _ = smooth(Surface(noisy, np.concatenate(mixed)), 0.004)
+    points, _ = smooth(Surface(noisy, np.concatenate(mixed)), 0.004, ALIKE)
     off = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 0]))  # from the nearer side
     far = np.concatenate([u, u]) > 0.006
     assert np.sqrt((off[far] ** 2).mean()) < 1e-4
@@ -62,7 +63,7 @@ def test_both_sides_of_a_thin_wall_stay_apart():
     for side in (-1, 1):
         points.append(np.stack([x, y, side * thick / 2 + 0.0004 * rng.normal(size=len(x))], -1))
         normals.append(np.tile([0.0, 0.0, side], (len(x), 1)))
-    smoothed, _ = smooth(Surface(np.concatenate(points), np.concatenate(normals)), 0.004)
+    smoothed, _ = smooth(Surface(np.concatenate(points), np.concatenate(normals)), 0.004, ALIKE)
     for part, side in zip(np.split(smoothed, 2), (-1, 1), strict=True):
         assert part[:, 2].mean() == pytest.approx(side * thick / 2, abs=2e-5) and part[:, 2].std() < 1.5e-4
 
@@ -70,5 +71,5 @@ def test_both_sides_of_a_thin_wall_stay_apart():
 def test_a_few_points_stay():
     rng = np.random.default_rng(3)
     few = Surface(rng.uniform(size=(5, 3)), np.tile([0.0, 0.0, 1.0], (5, 1)))
-    for before, after in zip(few, smooth(few, 0.004), strict=True):
+    for before, after in zip(few, smooth(few, 0.004, ALIKE), strict=True):
         np.testing.assert_array_equal(before, after)
