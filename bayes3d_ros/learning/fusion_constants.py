@@ -61,7 +61,9 @@ ROUND_WITHIN = 0.0003, 0.0008
 AROUND, AGREEING = 1 / 3, 0.8  # shares that agree: of the circle, of what is seen of it
 HOLLOW = 1 / 12  # share of a ring's voxels that are free where all of it inside the body is
 BESIDE_BODY = 0.012  # metres about the body in which other points speak against it
-NEAR_BODY = 0.004  # metres from points of the body in which other points have to be nearer than half of that to do so
+# Metres from points of the body in which its samples are sure where no others are nearer than half of that. Within that
+# half of its curve a point is its own though it bulges: returns beside a handle do.
+NEAR_BODY = 0.004
 
 # Votes on voxels (`fuse.py`)
 # Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.

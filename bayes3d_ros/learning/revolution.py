@@ -101,7 +101,7 @@ def _fit_body(surface: Surface, axis: Float[np.ndarray, "2"]) -> _BodyFit | None
     apart = rings.place - profile.place[node]
     along, height = (np.einsum("ni,ni->n", apart, way[node]) for way in (profile.along, profile.normal))
     off = height - np.einsum("nk,nk->n", profile.terms[node], along[:, None] ** np.arange(TERMS))
-    own = (node >= 0) & (np.abs(off) < profile.within)
+    own = (node >= 0) & (np.abs(off) < NEAR_BODY / 2)
     if (own & (np.abs(rings.normal[:, 0]) > STEEP)).sum() < SECTORS:
         return None
     return _BodyFit(rings, profile, node, along, off, own)
