@@ -56,7 +56,6 @@ class Profile(NamedTuple):
     terms: Float[np.ndarray, "P 3"]
     of_body: Bool[np.ndarray, "P"]
     past_edge: Bool[np.ndarray, "P"]  # nodes of the body that noise carried past its edges
-    within: float  # metres from the curve at which points agree with it
 
     @property
     def along(self) -> Float[np.ndarray, "P 2"]:
@@ -112,7 +111,7 @@ def profile_of(rings: Rings) -> Profile | None:
     agrees[near] &= np.abs(off) < within
     share = (_by_sector(agrees, node, cell, cells, len(place)) / np.maximum(shown, 1)).sum(1)
     of_body = (share >= AROUND * SECTORS) & (share >= AGREEING * (shown > 0).sum(1))
-    profile = Profile(place, normal, terms, of_body, np.zeros(len(place), bool), within)
+    profile = Profile(place, normal, terms, of_body, np.zeros(len(place), bool))
     return profile._replace(past_edge=_past_edges(profile))
 
 
