@@ -16,12 +16,14 @@ from bayes3d_ros.io.bags import read_frames
 from bayes3d_ros.io.learned_verdict import learned_verdict
 from bayes3d_ros.learning.fuse import FusionError, _hull
 from bayes3d_ros.learning.fusion_constants import PIXELS_A_VOXEL, PLACE_ERROR
-from bayes3d_ros.learning.learn import LearningError, learn, spread_views
+from bayes3d_ros.learning.learn import Learned, LearningError, learn, spread_views
 from bayes3d_ros.learning.segment import ViewError, middle, segment, thing_at
+from bayes3d_ros.objects.mesh_import import model_from_mesh
 from bayes3d_ros.objects.store import load_model, save_model
 from bayes3d_ros.resources import share_directory
 from bayes3d_ros.settings import LearnerSettings, UnfinishedSettings
-from bayes3d_ros.validation.simulate.capture_views import capture, shape_errors
+from bayes3d_ros.validation.simulate.capture_views import Captures, capture, shape_errors, yaw_onto
+from bayes3d_ros.validation.simulate.mug_images import upright_mug
 from bayes3d_ros.validation.simulate.random_scenes import REALSENSE, resting_object
 from bayes3d_ros.validation.simulate.ray_casting import Box, RayCaster
 from bayes3d_ros.validation.simulate.sensor_noise import SensorNoise, add_sensor_noise, sample_bias_field
@@ -538,3 +540,18 @@ def test_views_are_chosen_far_apart():
     chosen = spread_views(poses, 4)
     places = [round(poses[k][0, 3]) for k in chosen]
     assert places == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("turn", [-0.04, 0.015])
+def test_the_turn_of_a_model_on_its_mesh_is_found(turn):
+    """A mug from its mesh, with its frame turned; the body is round, so the handle alone tells."""
+    mug = upright_mug().thing
+    model = model_from_mesh(mug.mesh, mug.name, 0.002)
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    mesh = mug.mesh.copy()
+    mesh.vertices = mesh.vertices @ R.T  # where the captures' poses put it
+    captures = Captures([], np.zeros((0, 3)), np.eye(4))
+    seen = replace(model, surface_views=np.ones(len(model.surface_offset), int))
+    found = yaw_onto(Learned(seen, np.eye(4), (), 1.0), captures, mesh, np.zeros(2))
+    assert found == pytest.approx(turn, abs=1e-3)

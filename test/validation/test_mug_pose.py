@@ -185,7 +185,7 @@ def rows_of_parser(mug, clean):
             own = images.yaw[0] - turn + np.array([-0.05, 0.05])
             return SimpleNamespace(samples=samples_of(own, np.log([0.5, 0.5]), frame.T_table_camera))
 
-        known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, 1.0, ModelSizes((2048,), 32, 64))
+        known = KnownMug(SimpleNamespace(parse=parse, library=None), turn, -0.01, 1.0, ModelSizes((2048,), 32, 64))
         step = ParserStep(5, INDEPENDENT)
         assert [ParserStep(1).method, ParserStep(5, voxel_size=COARSER).method] == [PARSER, COARSE]
         return parser_rows(step, 0, lambda condition, group: truth, lambda step, group: known)
@@ -203,6 +203,7 @@ def test_the_parsers_rows_score_its_samples(rows_of_parser):
     assert np.cos(mean - row["yaw"][0]) == pytest.approx(1, abs=1e-6)
     assert (row["file_bytes"], row["memory_bytes"], row["padded_memory_bytes"]) == (2048, 32, 64)
     assert row["method"] == "Bayes3D (independent)" and row["training"] == 5
+    assert row["frame_off_degrees"] == pytest.approx(np.degrees(-0.01), abs=1e-3)
     assert [row["test"], *(o["test"] for o in others)] == list(MUG_CONDITIONS)
     lost = rows_of_parser(True)[0]
     assert lost["failed"] == 1 and lost["log_p_true"][0] == pytest.approx(-np.log(2 * np.pi), abs=1e-3)

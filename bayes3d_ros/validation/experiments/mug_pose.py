@@ -98,7 +98,7 @@ def notes(quick: bool) -> list[str]:
         "networks are trained on images of one camera and place, those of `as trained`",
         f"views are {VIEWED_FROM:g} m away and of 640 x 480 pixels, a hundred times as many as an image of "
         f"{MUG_CAMERA.width} x {MUG_CAMERA.height} has, with a D435's noise and exact camera poses; the mug is learned "
-        "anew for each group of images",
+        "anew for each group of images, and its yaw is that of its seen surface on the mesh",
         f"von Mises distributions of networks and of samples have concentrations of at most "
         f"{von_mises.LARGEST_CONCENTRATION:g}",
     ]

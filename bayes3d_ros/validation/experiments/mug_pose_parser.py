@@ -23,7 +23,7 @@ from bayes3d_ros.validation.experiments.mug_pose_summary import PARSER
 from bayes3d_ros.validation.experiments.mug_pose_truth import GROUP, Truth, mug_row
 from bayes3d_ros.validation.networks import von_mises
 from bayes3d_ros.validation.reference.exact_yaw import yaw_axis
-from bayes3d_ros.validation.simulate.capture_views import capture
+from bayes3d_ros.validation.simulate.capture_views import capture, yaw_onto
 from bayes3d_ros.validation.simulate.mug_images import MUG_CAMERA, MUG_CONDITIONS, MugImages, UprightMug
 from bayes3d_ros.validation.statistics.model_sizes import ModelSizes, model_sizes
 from bayes3d_ros.validation.statistics.yaw_samples import WeightedYaws, kernel_density, weighted_yaws, yaw_scores
@@ -59,6 +59,7 @@ class KnownMug(NamedTuple):
 
     parser: SceneParser
     turn: float  # radians
+    off: float  # radians by which that differs from what the poses of the captures say
     seconds: float  # of learning
     sizes: ModelSizes
 
@@ -66,7 +67,7 @@ class KnownMug(NamedTuple):
 def known_mug(mug: Callable[[], UprightMug], step: ParserStep, group: int) -> KnownMug:
     """A parser of the mug, compiled: of a mug that is learned from so many views around it, whose errors each group of
     test images has anew, or (TRUE_MESH) made from the mesh."""
-    thing, model, turn, seconds = mug().thing, None, 0.0, 0.0
+    thing, model, turn, off, seconds = mug().thing, None, 0.0, 0.0, 0.0
     if step.views == TRUE_MESH:
         model = model_from_mesh(thing.mesh, thing.name, step.voxel_size)
     else:
@@ -75,11 +76,13 @@ def known_mug(mug: Callable[[], UprightMug], step: ParserStep, group: int) -> Kn
         learned = learn(captures.frames, thing.name, replace(LEARNED, voxel_size=step.voxel_size))
         seconds = time.perf_counter() - start
         T_model_mesh = np.linalg.inv(learned.T_table_object) @ captures.T_table_object
-        model, turn = learned.model, float(np.arctan2(T_model_mesh[1, 0], T_model_mesh[0, 0]))
+        # A learned model's frame means nothing but its surface, whose handle may lie a degree beside the mesh's.
+        off = -yaw_onto(learned, captures, thing.mesh, captures.T_table_object[:2, 3])
+        model, turn = learned.model, float(np.arctan2(T_model_mesh[1, 0], T_model_mesh[0, 0])) + off
     library = _by_way_of_a_file(model)
     parser = SceneParser(library, replace(SETTINGS, likelihood=step.likelihood))
     parser.warm_up(MUG_CAMERA.width, MUG_CAMERA.height)
-    return KnownMug(parser, turn, seconds, model_sizes(library))
+    return KnownMug(parser, turn, off, seconds, model_sizes(library))
 
 
 def _by_way_of_a_file(model: ObjectModel) -> Library:
@@ -112,6 +115,7 @@ def parser_rows(
             mug_row(step.method, step.views, condition, fits, [own])
             | {"samples_cross_entropy": [round(s.cross_entropy, 4) for s in samples]}
             | {"samples_log_p_true": [round(s.log_p_true, 4) for s in samples]}
+            | {"frame_off_degrees": round(float(np.degrees(mug.off)), 3)}
             | {"failed": sum(one is None for one in found), "seconds": round(seconds, 2)}
             | {"learning_seconds": round(mug.seconds, 2), "file_bytes": max(mug.sizes.files)}
             | {"memory_bytes": mug.sizes.memory, "padded_memory_bytes": mug.sizes.padded_memory}

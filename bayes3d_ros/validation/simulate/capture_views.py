@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.camera import unproject
@@ -21,6 +22,7 @@ CAPTURE_DISTANCE = 0.6  # metres from the object's middle
 CAPTURE_PITCHES = (40.0, 30.0, 45.0)  # degrees downwards, in turn
 ALIGNED_POINTS = 40_000
 _ALIGN_ROUNDS, _TRIMMED = 30, 0.9
+_TURNS = -0.1, 0.1  # radians, within which `yaw_onto` looks
 
 
 class Captures(NamedTuple):
@@ -57,6 +59,25 @@ def capture(
         told = disturbed(T_table_camera, *pose_noise, pose_rng)
         frames.append(DepthFrame(depth.astype(np.float32), REALSENSE, (k + 1) * 10**9, "camera", told))
     return Captures(frames, np.concatenate(seen), T_table_object)
+
+
+def yaw_onto(learned: Learned, captures: Captures, mesh: trimesh.Trimesh, about: Float[np.ndarray, "2"]) -> float:
+    """The turn about an upright axis, through `about` in the table frame, after which the model's seen surface lies
+    nearest to the true one where it was captured (least mean square). Radians."""
+    surface = np.asarray(trimesh.sample.sample_surface(mesh, ALIGNED_POINTS, seed=0)[0])
+    T = captures.T_table_object
+    tree = cKDTree(surface @ T[:3, :3].T + T[:3, 3])
+    model = learned.model
+    assert model.surface_views is not None
+    points = model.surface_points[model.surface_views > 0] + learned.T_table_object[:3, 3]
+
+    def misfit(yaw: float) -> float:
+        turned = points.copy()
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned[:, :2] = (points[:, :2] - about) @ np.array([[c, s], [-s, c]]) + about
+        return float((tree.query(turned)[0] ** 2).mean())
+
+    return float(minimize_scalar(misfit, bounds=_TURNS, method="bounded").x)
 
 
 class ShapeErrors(NamedTuple):
