@@ -5,7 +5,8 @@
 Every view votes on every voxel: for a surface where points fall into it, for free space where rays pass through to
 something behind it; what a view's rays do not reach it says nothing of. Votes are log odds, so that flying pixels of
 one view, or one view whose pose is wrong, lose against the others. Planes are then fitted to the points of the voxels
-that won, after the points have been smoothed (`smooth.py`). Voxels that nobody saw count as solid inside the convex
+that won, after the points have been smoothed (`smooth.py`) and those of a round body moved onto its profile
+(`revolution.py`), which also has points where no view looked. Voxels that nobody saw count as solid inside the convex
 hull of the surface, but for those before all planes beside them and those between free ones, and are known to be unseen
 (`unseen.py`).
 """
@@ -41,7 +42,7 @@ from bayes3d_ros.learning.fusion_constants import (
     SHARPER,
     THIN,
 )
-from bayes3d_ros.learning.revolution import Body, body_of_revolution, hollow
+from bayes3d_ros.learning.revolution import body_of_revolution, hollow, without
 from bayes3d_ros.learning.segment import Surface
 from bayes3d_ros.learning.smooth import smooth
 from bayes3d_ros.learning.tuning import TUNING
@@ -70,11 +71,18 @@ class Seen(NamedTuple):
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
-    views, every, body = _smoothed(views, voxel_size)
-    grid = _grid([view.surface for view in views], voxel_size)
+    views = _smoothed(views, voxel_size)
+    every = _together(views)
+    body = body_of_revolution(every) if len(views) > 1 else None
+    if body is not None:
+        places = body.samples.points
+        free = [sees_beyond(view.frame, view.T_table_camera, places, BEHIND_VOXEL) for view in views]
+        body = without(body, np.any(free, 0))
+        views, every = _divided(body.surface, views), body.whole
+    grid = _grid([every, *(view.surface for view in views)], voxel_size)
     centres = grid.centres()
     seen = np.sum([_hits(view.surface, grid) for view in views], 0).reshape(grid.shape)
-    hits = np.maximum(seen, _hits(every, grid).reshape(grid.shape))  # a body of revolution goes on where none is seen
+    hits = seen if body is None else np.maximum(seen, _hits(body.samples, grid).reshape(grid.shape))
     if not hits.any():
         raise FusionError(f"no voxel of {voxel_size} m holds two points of one view: expected a larger voxel_size")
     rays = np.array([_passed(centres, view.frame, view.T_table_camera, voxel_size) for view in views])
@@ -138,23 +146,23 @@ def _unknown(
     return unknown
 
 
-def _smoothed(views: Sequence[Seen], voxel_size: float) -> tuple[list[Seen], Surface, Body | None]:
-    """The views without the noise of single pixels, and what they show together: of a body of revolution that several
-    views show, points all round."""
-    every = Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
-    several = len(views) > 1
-    for alike in (ALIKE, SHARPER) if several else (ALIKE,):
+def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:
+    """What all views show together, without the noise of single pixels."""
+    every = _together(views)
+    for alike in (ALIKE, SHARPER) if len(views) > 1 else (ALIKE,):
         every = smooth(every, voxel_size, alike)
-    body = body_of_revolution(every) if several else None
-    whole = every
-    if body is not None:
-        every = body.surface
-        whole = Surface(
-            *(np.concatenate([part[~body.own], own]) for part, own in zip(every, body.samples, strict=True))
-        )
+    return _divided(every, views)
+
+
+def _together(views: Sequence[Seen]) -> Surface:
+    return Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
+
+
+def _divided(every: Surface, views: Sequence[Seen]) -> list[Seen]:
+    """The views, with as many of these points each as they had."""
     ends = np.cumsum([len(view.surface.points) for view in views])[:-1]
     parts = zip(*(np.split(part, ends) for part in every), strict=True)
-    return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)], whole, body
+    return [view._replace(surface=Surface(*part)) for view, part in zip(views, parts, strict=True)]
 
 
 def _steeper(front: Patches, second: SecondPlanes, grid: VoxelGrid) -> Patches:

@@ -53,17 +53,16 @@ FEWEST_CELLS = 12  # that a fit needs
 SECTORS, FACINGS = 36, 16  # of azimuth; of directions across the profile
 PROFILE_CELL, PROFILE_WIDTH = 0.001, 0.003  # metres: cells of the profile; standard deviation of a fit's weights
 ONE_CURVE = 0.9  # cosine between normals of one curve, at least
-PAST_EDGE = 0.0002  # metres above another side, where a side ends at an edge
+PAST_EDGE = 0.0002  # metres above another side of the body from which a side has passed the edge between them
 UPRIGHT_TURN = 0.35  # sine of the angle by which a normal of the body misses the plane through its axis, at most
-# Metres from the curve at which points agree with it: three standard deviations of what is seen all round, from the
-# first to the second.
+# Metres from the curve at which points agree with it: three standard deviations of what is seen all round, clipped to
+# this range.
 ROUND_WITHIN = 0.0003, 0.0008
 AROUND, AGREEING = 1 / 3, 0.8  # shares that agree: of the circle, of what is seen of it
-HOLLOW = 1 / 12  # share of a ring's voxels that are free where all of it inside the body is
-BESIDE_BODY = 0.012  # metres about the body in which other points speak against it
-# Metres from points of the body in which its samples are sure where no others are nearer than half of that. Within that
-# half of its curve a point is its own though it bulges: returns beside a handle do.
-NEAR_BODY = 0.004
+# If more than this share of the voxels on a ring is free, those that no view saw inside the body are free.
+HOLLOW = 1 / 12
+BESIDE_BODY = 0.012  # metres: samples so near to points that are not of the body need points of the body beside them
+NEAR_BODY = 0.004  # metres: points within half of this of the body are moved onto it, bulges beside a handle too
 
 # Votes on voxels (`fuse.py`)
 # Nats a view: log p(points in it | surface) / p(.. | free), and the reverse for rays through all of it or its middle.

@@ -35,6 +35,7 @@ TERMS = 3  # of a quadratic
 _ROUNDS = 8  # of reweighting: weights settle in five
 _REACH = 2.0  # widths of a profile's weights: cells farther off do not count
 _FEWEST_POINTS = 2  # of a cell
+_AT_A_TIME = 128  # nodes, which bounds memory
 _NODES = 8  # nearest to a point, among which its own is sought
 
 
@@ -51,8 +52,8 @@ class Rings(NamedTuple):
 class Profile(NamedTuple):
     """Height of the curve along each node's normal, c0 + c1 t + c2 t^2, t along the curve from the node, metres."""
 
-    place: Float[np.ndarray, "P 2"]
-    normal: Float[np.ndarray, "P 2"]
+    place: Float[np.ndarray, "P 2"]  # radius and height of each node, metres
+    normal: Float[np.ndarray, "P 2"]  # unit vectors, outward and up
     terms: Float[np.ndarray, "P 3"]
     of_body: Bool[np.ndarray, "P"]
     past_edge: Bool[np.ndarray, "P"]  # nodes of the body that noise carried past its edges
@@ -73,6 +74,7 @@ class _ProfileCells(NamedTuple):
 
 
 def rings_about(surface: Surface, axis: Float[np.ndarray, "2"]) -> Rings:
+    """Points of a surface in cylindrical coordinates about an upright axis (its x and y, metres, table frame)."""
     apart = surface.points[:, :2] - axis
     radius = np.linalg.norm(apart, axis=1)
     outward = apart / np.maximum(radius, 1e-9)[:, None]
@@ -87,20 +89,18 @@ def rings_about(surface: Surface, axis: Float[np.ndarray, "2"]) -> Rings:
 
 
 def profile_of(rings: Rings) -> Profile | None:
-    """None where no cell holds points enough, or nothing goes round."""
+    """The curve that fits points all round, and which nodes of it are the body's; None where no cell holds points
+    enough, or nothing goes round."""
     cells = _cells(rings)
     if not cells.radial.any():
         return None
     place, normal = _nodes(cells)
-    along = np.stack([-normal[:, 1], normal[:, 0]], 1)
-    node, cell = _pairs(place, cells.place, BESIDE_BODY)
-    apart = cells.place[cell] - place[node]
-    t, height = (np.einsum("pi,pi->p", apart, way[node]) for way in (along, normal))
+    node, cell, t, height = _pairs(place, normal, cells)
     alike = np.einsum("pi,pi->p", cells.normal[cell], normal[node])
     near = cells.radial[cell] & (np.hypot(t, height) < _REACH * PROFILE_WIDTH) & (alike > ONE_CURVE)
     terms, off = _fits(node[near], t[near], height[near], len(place))
     close = np.abs(t) < PROFILE_WIDTH
-    shown = _by_sector(close & (alike > ALIKE), node, cell, cells, len(place))
+    shown = _by_sector(close, node, cell, cells, len(place))
     around = _by_sector(close & near, node, cell, cells, len(place))
     enough = (around > 0).sum(1) >= AROUND * SECTORS
     scatter = np.abs(off[(close & near)[near] & enough[node[near]]])
@@ -116,7 +116,7 @@ def profile_of(rings: Rings) -> Profile | None:
 
 
 def _cells(rings: Rings) -> _ProfileCells:
-    """Of points that are radial and others apart."""
+    """Points whose normals' planes hold the axis and other points have cells of their own."""
     sector = np.floor((rings.azimuth / (2 * np.pi) % 1.0) * SECTORS).astype(int) % SECTORS
     cell = np.floor(rings.place / PROFILE_CELL).astype(int)
     key = np.column_stack([cell, _facing(rings.normal), rings.radial, sector])
@@ -152,11 +152,26 @@ def _means(
 
 
 def _pairs(
-    one: Float[np.ndarray, "P 2"], other: Float[np.ndarray, "C 2"], within: float
-) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
-    """Rows of `one` and `other` that lie within so many metres of each other, in order of the first."""
-    near = cKDTree(other).query_ball_point(one, within)
-    return np.repeat(np.arange(len(one)), [len(each) for each in near]), np.concatenate(near).astype(int)
+    place: Float[np.ndarray, "P 2"], normal: Float[np.ndarray, "P 2"], cells: _ProfileCells
+) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"], Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+    """Rows of nodes, and of the cells about each that face as it does, in order of the nodes; how far the cell lies
+    along and above the node, metres."""
+    tree = cKDTree(cells.place)
+    found = []
+    for start in range(0, len(place), _AT_A_TIME):
+        own = slice(start, start + _AT_A_TIME)
+        near = tree.query_ball_point(place[own], BESIDE_BODY)
+        node = start + np.repeat(np.arange(len(near)), [len(each) for each in near])
+        cell = np.concatenate(near).astype(int)
+        facing = np.einsum("pi,pi->p", cells.normal[cell], normal[node]) > ALIKE
+        node, cell = node[facing], cell[facing]
+        apart = cells.place[cell] - place[node]
+        t = apart[:, 1] * normal[node, 0] - apart[:, 0] * normal[node, 1]
+        height = np.einsum("pi,pi->p", apart, normal[node])
+        beside = (np.abs(t) < PROFILE_WIDTH) | (np.hypot(t, height) < _REACH * PROFILE_WIDTH)
+        found.append((node[beside], cell[beside], t[beside], height[beside]))
+    node, cell, t, height = (np.concatenate(part) for part in zip(*found, strict=True))
+    return node, cell, t, height
 
 
 def _fits(
@@ -214,8 +229,8 @@ def _past_edges(profile: Profile) -> Bool[np.ndarray, "P"]:
 
 
 def own_nodes(rings: Rings, profile: Profile) -> Int[np.ndarray, "N"]:
-    """Of every point the nearest node of the body that faces as it does, -1 where none is near it or noise carried that
-    past an edge."""
+    """Of every point the row of the nearest node of the body that faces as it does; -1 where none is near it, or noise
+    carried that past an edge."""
     body = np.flatnonzero(profile.of_body)
     count = min(_NODES, len(body))
     far, found = cKDTree(profile.place[body]).query(rings.place, k=list(range(1, count + 1)))
@@ -231,7 +246,8 @@ def own_nodes(rings: Rings, profile: Profile) -> Int[np.ndarray, "N"]:
 def curve(
     profile: Profile, node: Int[np.ndarray, "N"], t: Float[np.ndarray, "N"]
 ) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
-    """Points and unit normals of the curve of each node."""
+    """Radius and height (metres) and unit normals of points on the curves of these nodes, t metres along the curve from
+    the node."""
     c, normal, along = profile.terms[node], profile.normal[node], profile.along[node]
     height, slope = c[:, 0] + c[:, 1] * t + c[:, 2] * t**2, c[:, 1] + 2 * c[:, 2] * t
     return profile.place[node] + t[:, None] * along + height[:, None] * normal, _unit(normal - slope[:, None] * along)

@@ -28,16 +28,27 @@ from bayes3d_ros.learning.profile import TERMS, Profile, Rings, curve, own_nodes
 from bayes3d_ros.learning.segment import Surface
 
 _AXIS_ROUNDS = 20
+_FEWEST_WALL_POINTS = 36
 _GOLDEN = 0.618  # steps by this share of a range fill it evenly
 
 
 class Body(NamedTuple):
-    """What of a surface is of revolution."""
+    """The part of a surface that is of revolution; metres, table frame."""
 
-    surface: Surface  # the same points, those of the body on its profile
+    surface: Surface  # the points that were given, those of the body moved onto its profile
     own: Bool[np.ndarray, "N"]  # points of the body
-    samples: Surface  # of the body, as dense as its points; also where nothing was measured
-    axis: Float[np.ndarray, "2"]  # metres, table frame
+    samples: Surface  # of the body, all round, also where nothing was measured; as dense as its points where those are
+    guessed: Bool[np.ndarray, "M"]  # samples where nothing was measured
+    axis: Float[np.ndarray, "2"]  # x and y of the upright axis
+
+    @property
+    def whole(self) -> Surface:
+        """Samples of the body, the points that are not of the body, and those of the body that no sample is near."""
+        if not len(self.samples.points):
+            return self.surface
+        apart, _ = cKDTree(_placed(self.samples)).query(_placed(self.surface))
+        kept = ~self.own | (apart > NEAR_BODY / 2)
+        return Surface(*(np.concatenate([a[kept], b]) for a, b in zip(self.surface, self.samples, strict=True)))
 
 
 class _BodyFit(NamedTuple):
@@ -54,7 +65,7 @@ class _BodyFit(NamedTuple):
 def body_of_revolution(surface: Surface) -> Body | None:
     """The part of a surface in the table frame that is of revolution about an upright axis; None where there is
     none."""
-    if (np.abs(surface.normals[:, 2]) < STEEP).sum() < SECTORS:
+    if (np.abs(surface.normals[:, 2]) < STEEP).sum() < _FEWEST_WALL_POINTS:
         return None
     axis = _axis(surface)
     rough = _fit_body(surface, axis)
@@ -65,20 +76,34 @@ def body_of_revolution(surface: Surface) -> Body | None:
     fit = _fit_body(surface, axis)
     if fit is None:
         return None
-    moved = _onto(surface, fit)
-    samples = _clear_samples(_samples(fit.profile, fit.node[fit.own], fit.along[fit.own], axis), moved, fit.own)
-    apart, nearest = cKDTree(samples.points).query(moved.points)
-    stray = ~fit.own & (apart < NEAR_BODY / 2)  # so near to the body that they must be noise of it
-    for part, body in zip(moved, samples, strict=True):
-        part[stray] = body[nearest[stray]]
-    return Body(moved, fit.own | stray, samples, axis)
+    moved = _onto(surface, fit, axis)
+    samples, guessed = _clear_samples(_samples(fit, axis), moved, fit.own)
+    if len(samples.points):
+        apart, nearest = cKDTree(_placed(samples)).query(_placed(moved))
+        stray = ~fit.own & (apart < NEAR_BODY / 2)  # so near to the body that they must be noise of it
+        for part, body in zip(moved, samples, strict=True):
+            part[stray] = body[nearest[stray]]
+        fit = fit._replace(own=fit.own | stray)
+    return Body(moved, fit.own, samples, guessed, axis)
+
+
+def _placed(surface: Surface) -> Float[np.ndarray, "N 6"]:
+    """Points and normals, to be compared with others: the two sides of a wall are 2 NEAR_BODY apart."""
+    return np.column_stack([surface.points, NEAR_BODY * surface.normals])
+
+
+def without(body: Body, free: Bool[np.ndarray, "M"]) -> Body:
+    """The body without the samples that were guessed where views see through."""
+    kept = ~(body.guessed & free)
+    samples = Surface(*(part[kept] for part in body.samples))
+    return body._replace(samples=samples, guessed=body.guessed[kept])
 
 
 def hollow(
     body: Body, free: Bool[np.ndarray, "X Y Z"], surface: Bool[np.ndarray, "X Y Z"], grid: VoxelGrid
 ) -> Bool[np.ndarray, "X Y Z"]:
-    """Voxels inside the body on whose ring about its axis views found others free and hardly any of the surface: no
-    view looks down to the foot of a cup on all sides."""
+    """Voxels inside the body whose ring about its axis is free where views tell: no view sees the foot of a cup on all
+    sides. free: voxels that views found free; surface: voxels of the surface that was seen."""
     centres = grid.centres()
     radius = np.linalg.norm(centres[:, :2] - body.axis, axis=1)
     layer = np.floor((centres[:, 2] - grid.origin[2]) / grid.voxel_size).astype(int)
@@ -102,7 +127,7 @@ def _fit_body(surface: Surface, axis: Float[np.ndarray, "2"]) -> _BodyFit | None
     along, height = (np.einsum("ni,ni->n", apart, way[node]) for way in (profile.along, profile.normal))
     off = height - np.einsum("nk,nk->n", profile.terms[node], along[:, None] ** np.arange(TERMS))
     own = (node >= 0) & (np.abs(off) < NEAR_BODY / 2)
-    if (own & (np.abs(rings.normal[:, 0]) > STEEP)).sum() < SECTORS:
+    if (own & (np.abs(rings.normal[:, 0]) > STEEP)).sum() < _FEWEST_WALL_POINTS:
         return None
     return _BodyFit(rings, profile, node, along, off, own)
 
@@ -122,51 +147,54 @@ def _axis(surface: Surface) -> Float[np.ndarray, "2"]:
     return axis
 
 
-def _onto(surface: Surface, fit: _BodyFit) -> Surface:
+def _onto(surface: Surface, fit: _BodyFit, axis: Float[np.ndarray, "2"]) -> Surface:
     """The surface, its points of the body on the curves of their nodes."""
     points, normals, own = surface.points.copy(), surface.normals.copy(), fit.own
     place, normal = curve(fit.profile, fit.node[own], fit.along[own])
-    points[own], normals[own] = _turned(place - [1, 0] * fit.rings.place[own], normal, fit.rings.outward[own])
-    points[own, :2] += surface.points[own, :2]
+    points[own], normals[own] = _turned(place, normal, fit.rings.outward[own], axis)
     return Surface(points, normals)
 
 
 def _turned(
-    place: Float[np.ndarray, "N 2"], normal: Float[np.ndarray, "N 2"], outward: Float[np.ndarray, "N 2"]
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-    """Radius and height, and normals of a profile, in these directions from the axis."""
-    point, unit = (np.column_stack([part[:, :1] * outward, part[:, 1]]) for part in (place, normal))
-    return point, unit
-
-
-def _samples(
-    profile: Profile, node: Int[np.ndarray, "B"], t: Float[np.ndarray, "B"], axis: Float[np.ndarray, "2"]
+    place: Float[np.ndarray, "N 2"],
+    normal: Float[np.ndarray, "N 2"],
+    outward: Float[np.ndarray, "N 2"],
+    axis: Float[np.ndarray, "2"],
 ) -> Surface:
-    """As many points as there are, which lie at t on the curves of their nodes, spread evenly over all azimuths."""
+    """Points and normals of a profile in these directions from the axis."""
+    return Surface(
+        np.column_stack([axis + place[:, :1] * outward, place[:, 1]]),
+        np.column_stack([normal[:, :1] * outward, normal[:, 1]]),
+    )
+
+
+def _samples(fit: _BodyFit, axis: Float[np.ndarray, "2"]) -> Surface:
+    """Points of the body, spread evenly over all azimuths; where each lies along its node's curve a measured one
+    does."""
+    node, along = fit.node[fit.own], fit.along[fit.own]
+    sectors = len(np.unique(np.floor(fit.rings.azimuth[fit.own] / (2 * np.pi) * SECTORS)))
     order = np.argsort(node, kind="stable")
     body, first, there = np.unique(node[order], return_index=True, return_counts=True)
-    length = np.maximum(2 * np.pi * profile.place[body, 0], PROFILE_CELL)
-    number = np.maximum(np.round(length * len(node) / length.sum()).astype(int), 1)
+    length = np.maximum(2 * np.pi * fit.profile.place[body, 0], PROFILE_CELL)
+    number = np.maximum(np.round(length * len(node) * SECTORS / sectors / length.sum()).astype(int), 1)
     ring = np.repeat(np.arange(len(body)), number)
     step = np.arange(len(ring)) - np.repeat(np.cumsum(number) - number, number)
     other = first[ring] + np.floor(_GOLDEN * step % 1.0 * there[ring]).astype(int)
-    place, normal = curve(profile, body[ring], t[order][other])
+    place, normal = curve(fit.profile, body[ring], along[order][other])
     turn = 2 * np.pi * (step / number[ring] + _GOLDEN * ring % 1.0)  # rings' points lie between each other
-    points, normals = _turned(place, normal, np.stack([np.cos(turn), np.sin(turn)], 1))
-    points[:, :2] += axis
-    return Surface(points, normals)
+    return _turned(place, normal, np.stack([np.cos(turn), np.sin(turn)], 1), axis)
 
 
-def _clear_samples(samples: Surface, surface: Surface, own: Bool[np.ndarray, "N"]) -> Surface:
-    """Those that lie beside points of the body, or beside none of anything."""
-    points, normals = samples
-
-    def placed(points: Float[np.ndarray, "M 3"], normals: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 6"]:
-        return np.column_stack([points, NEAR_BODY * normals])  # sides of a wall are apart
-
-    body, _ = cKDTree(placed(surface.points[own], surface.normals[own])).query(placed(points, normals))
+def _clear_samples(
+    samples: Surface, surface: Surface, own: Bool[np.ndarray, "N"]
+) -> tuple[Surface, Bool[np.ndarray, "M"]]:
+    """Those that lie at points of the body, and those that are far from all other points; which are the latter."""
+    body, _ = cKDTree(_placed(Surface(*(part[own] for part in surface)))).query(_placed(samples))
+    measured = body < PROFILE_CELL
+    clear = measured.copy()
     if own.all():
-        return samples
-    other, _ = cKDTree(surface.points[~own]).query(points)
-    clear = (other > np.where(body < NEAR_BODY, NEAR_BODY / 2, BESIDE_BODY)) | (body < PROFILE_CELL)
-    return Surface(points[clear], normals[clear])
+        clear[:] = True
+    else:
+        other, _ = cKDTree(surface.points[~own]).query(samples.points)
+        clear |= other > BESIDE_BODY
+    return Surface(samples.points[clear], samples.normals[clear]), ~measured[clear]

@@ -553,5 +553,15 @@ def test_the_turn_of_a_model_on_its_mesh_is_found(turn):
     mesh.vertices = mesh.vertices @ R.T  # where the captures' poses put it
     captures = Captures([], np.zeros((0, 3)), np.eye(4))
     seen = replace(model, surface_views=np.ones(len(model.surface_offset), int))
-    found = yaw_onto(Learned(seen, np.eye(4), (), 1.0), captures, mesh, np.zeros(2))
+    mesh.vertices += [3e-4, -5e-4, 0.0]  # which is no turn
+    found = yaw_onto(Learned(seen, np.eye(4), (), 1.0), captures, mesh)
     assert found == pytest.approx(turn, abs=1e-3)
+
+
+def test_a_box_with_a_round_knob_stays_a_box():
+    """Its top is level all round the knob, and ends at its edges."""
+    box = trimesh.creation.box((0.07, 0.07, 0.05)).apply_translation((0, 0, 0.025))
+    knob = trimesh.creation.cylinder(0.012, 0.02, sections=60).apply_translation((0, 0, 0.06))
+    thing = resting_object("box", trimesh.util.concatenate([box, knob]))
+    found = learn(capture(thing, np.eye(4), 4, (0.0, 0.0), seed=5).frames, "box", LearnerSettings(voxel_size=0.004))
+    assert found.model.box_size[:2] == pytest.approx([0.07, 0.07], abs=0.004)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayes3d_ros.learning.fusion_constants import NEAR_BODY
-from bayes3d_ros.learning.revolution import body_of_revolution
+from bayes3d_ros.learning.revolution import body_of_revolution, without
 from bayes3d_ros.learning.segment import Surface
 
 SPACING = 0.0007  # metres between points
@@ -148,6 +148,29 @@ def test_no_samples_lie_where_the_surface_is_another():
     around = np.abs(np.arctan2(*(body.samples.points[:, :2] - AXIS).T[::-1]))
     assert around.min() > half - NEAR_BODY / RADIUS
     assert np.histogram(around, 20, (half, np.pi))[0].min() > 0
+
+
+def test_the_inside_of_a_thin_wall_is_not_turned_inside_out():
+    """Of a wall of 1.5 mm the inside is seen over 100 degrees alone, too little to be of a body."""
+    outer, inner = wall(RADIUS, 1), wall(RADIUS - 0.0015, -1)
+    seen = np.abs(np.arctan2(*(inner.points[:, :2] - AXIS).T[::-1])) < np.radians(50)
+    before = together(outer, Surface(inner.points[seen], inner.normals[seen]))
+    body = body_of_revolution(before)
+    assert body is not None and not body.own[len(outer.points) :].any()
+    np.testing.assert_array_equal(body.surface.normals[len(outer.points) :], inner.normals[seen])
+
+
+def test_the_top_of_a_box_ends_where_it_ends():
+    """A box with a round knob: its top is level all round, but no disc."""
+    half, top = 0.03, np.arange(-0.03, 0.03, SPACING)
+    x, y = (a.ravel() for a in np.meshgrid(top, top))
+    level = np.column_stack([x + AXIS[0], y + AXIS[1], np.full(len(x), HEIGHT)])
+    knob = wall(0.012, 1, HEIGHT, HEIGHT + 0.02)
+    body = body_of_revolution(together(prism(4, half), Surface(level, np.tile([0.0, 0, 1], (len(x), 1))), knob))
+    assert body is not None
+    beyond = np.abs(body.samples.points[:, :2] - AXIS).max(1) > half + 0.0015
+    assert body.guessed[beyond].all()
+    assert (without(body, beyond).samples.points[:, :2] - AXIS).max() < half + 0.0015
 
 
 def test_a_few_points_have_no_body():

@@ -77,7 +77,7 @@ def known_mug(mug: Callable[[], UprightMug], step: ParserStep, group: int) -> Kn
         seconds = time.perf_counter() - start
         T_model_mesh = np.linalg.inv(learned.T_table_object) @ captures.T_table_object
         # A learned model's frame means nothing but its surface, whose handle may lie a degree beside the mesh's.
-        off = -yaw_onto(learned, captures, thing.mesh, captures.T_table_object[:2, 3])
+        off = -yaw_onto(learned, captures, thing.mesh)
         model, turn = learned.model, float(np.arctan2(T_model_mesh[1, 0], T_model_mesh[0, 0])) + off
     library = _by_way_of_a_file(model)
     parser = SceneParser(library, replace(SETTINGS, likelihood=step.likelihood))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from bayes3d_ros.geometry.camera import unproject
@@ -22,7 +22,7 @@ CAPTURE_DISTANCE = 0.6  # metres from the object's middle
 CAPTURE_PITCHES = (40.0, 30.0, 45.0)  # degrees downwards, in turn
 ALIGNED_POINTS = 40_000
 _ALIGN_ROUNDS, _TRIMMED = 30, 0.9
-_TURNS = -0.1, 0.1  # radians, within which `yaw_onto` looks
+_MM, _ARM = 1000.0, 0.05  # a metre in millimetres; metres from a mug's axis at which a turn counts as a shift
 
 
 class Captures(NamedTuple):
@@ -61,23 +61,35 @@ def capture(
     return Captures(frames, np.concatenate(seen), T_table_object)
 
 
-def yaw_onto(learned: Learned, captures: Captures, mesh: trimesh.Trimesh, about: Float[np.ndarray, "2"]) -> float:
-    """The turn about an upright axis, through `about` in the table frame, after which the model's seen surface lies
+def yaw_onto(learned: Learned, captures: Captures, mesh: trimesh.Trimesh) -> float:
+    """The turn about an upright axis with which, and with the best shift along the table, the model's seen surface lies
     nearest to the true one where it was captured (least mean square). Radians."""
+    points, tree = _seen_points(learned), cKDTree(_true_surface(captures, mesh))
+    middle = points[:, :2].mean(0)
+
+    def misfit(motion: Float[np.ndarray, "3"]) -> float:
+        moved = points.copy()
+        shift, yaw = motion[:2] / _MM, motion[2] / _MM / _ARM
+        c, s = np.cos(yaw), np.sin(yaw)
+        moved[:, :2] = (points[:, :2] - middle) @ np.array([[c, s], [-s, c]]) + middle + shift
+        return float((tree.query(moved)[0] ** 2).mean()) * _MM**2
+
+    start = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    found = minimize(misfit, np.zeros(3), method="Nelder-Mead", options={"initial_simplex": start, "xatol": 0.01})
+    return float(found.x[2]) / _MM / _ARM
+
+
+def _true_surface(captures: Captures, mesh: trimesh.Trimesh) -> Float[np.ndarray, "M 3"]:
+    """Points of the mesh where it was captured, table frame."""
     surface = np.asarray(trimesh.sample.sample_surface(mesh, ALIGNED_POINTS, seed=0)[0])
     T = captures.T_table_object
-    tree = cKDTree(surface @ T[:3, :3].T + T[:3, 3])
-    model = learned.model
-    assert model.surface_views is not None
-    points = model.surface_points[model.surface_views > 0] + learned.T_table_object[:3, 3]
+    return surface @ T[:3, :3].T + T[:3, 3]
 
-    def misfit(yaw: float) -> float:
-        turned = points.copy()
-        c, s = np.cos(yaw), np.sin(yaw)
-        turned[:, :2] = (points[:, :2] - about) @ np.array([[c, s], [-s, c]]) + about
-        return float((tree.query(turned)[0] ** 2).mean())
 
-    return float(minimize_scalar(misfit, bounds=_TURNS, method="bounded").x)
+def _seen_points(learned: Learned) -> Float[np.ndarray, "N 3"]:
+    """Points of the model's surface that views saw, table frame."""
+    assert learned.model.surface_views is not None
+    return learned.model.surface_points[learned.model.surface_views > 0] + learned.T_table_object[:3, 3]
 
 
 class ShapeErrors(NamedTuple):
@@ -91,12 +103,7 @@ class ShapeErrors(NamedTuple):
 def shape_errors(learned: Learned, captures: Captures, mesh: trimesh.Trimesh, aligned: bool) -> ShapeErrors:
     """Distances of the model's seen surface from the true one, where it was captured. `aligned`: moved rigidly onto it
     first, as poses that are wrong on average leave the model where it is not, but of the right shape."""
-    surface = np.asarray(trimesh.sample.sample_surface(mesh, ALIGNED_POINTS, seed=0)[0])
-    T = captures.T_table_object
-    surface = surface @ T[:3, :3].T + T[:3, 3]
-    model = learned.model
-    assert model.surface_views is not None
-    points = model.surface_points[model.surface_views > 0] + learned.T_table_object[:3, 3]
+    surface, points, model = _true_surface(captures, mesh), _seen_points(learned), learned.model
     tree = cKDTree(surface)
     if aligned:
         points = _onto(points, surface, tree)
