@@ -71,10 +71,11 @@ class Seen(NamedTuple):
 
 def fuse(views: Sequence[Seen], voxel_size: float) -> Fused:
     """Raises FusionError with one line where nothing is left of the object."""
-    views = _smoothed(views, voxel_size)
-    every = _together(views)
+    every = _smoothed(views, voxel_size)
     body = body_of_revolution(every) if len(views) > 1 else None
-    if body is not None:
+    if body is None:
+        views = _divided(every, views)
+    else:
         places = body.samples.points
         free = [sees_beyond(view.frame, view.T_table_camera, places, BEHIND_VOXEL) for view in views]
         body = without(body, np.any(free, 0))
@@ -146,16 +147,12 @@ def _unknown(
     return unknown
 
 
-def _smoothed(views: Sequence[Seen], voxel_size: float) -> list[Seen]:
+def _smoothed(views: Sequence[Seen], voxel_size: float) -> Surface:
     """What all views show together, without the noise of single pixels."""
-    every = _together(views)
+    every = Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
     for alike in (ALIKE, SHARPER) if len(views) > 1 else (ALIKE,):
         every = smooth(every, voxel_size, alike)
-    return _divided(every, views)
-
-
-def _together(views: Sequence[Seen]) -> Surface:
-    return Surface(*(np.concatenate(part) for part in zip(*(view.surface for view in views), strict=True)))
+    return every
 
 
 def _divided(every: Surface, views: Sequence[Seen]) -> list[Seen]:
